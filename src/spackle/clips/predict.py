@@ -50,7 +50,8 @@ def clip_options(scene: PipelineOptions, photo: PhotoOptions, workers: int) -> P
             installed.
     """
     _check_options_suit_clips(scene, photo, workers)
-    OpenCV("a clip, whose motion has to be followed,")  # fails if it is not installed
+    # Fails if OpenCV is not installed. The text is the beginning of the message.
+    OpenCV("a clip, whose motion has to be followed,")
     if scene.fill.fill != "auto":
         return scene
 
@@ -210,7 +211,7 @@ def clip_report(
         },
         "aux": {
             "gaussians": round(fmean(frame.aux_count for frame in measures))
-        },  # mean of a frame
+        },  # mean over frames
         "disparity": disparity,
         "hole_area_ratio": {
             "before": fmean(frame.hole_ratio_before for frame in measures),
@@ -265,9 +266,9 @@ class FramePredictor:
             disparity=options.path.disparity,
             frame_count=len(clip),
             renderer=pipeline.renderer,
-            flow=OpenCV("a clip").flow,
+            flow=OpenCV("a clip").flow,  # the text names what needs OpenCV, should it be missing
             align=depth_may_flicker,
-            fill=options.fill.texture != "none",
+            fill=options.fill.texture != "none",  # "none" leaves all holes open
             network=pipeline.network,
             precision=options.base.precision,
             overscan=options.path.overscan,

@@ -92,7 +92,8 @@ def propagate_colors(
     recalled = recalled * _exposure_gain(previous, completed_light, tracked, hole)
     weight = torch.where(hole, TRUST_DECAY * weight, 0.0)
 
-    # Pixels that the previous view does not show take over the change of those that it shows.
+    # Pixels of a hole that the previous view does not show are fresh. Their completed colour takes
+    # over the change of the pixels around that the previous view shows.
     change = recalled - completed_light
     fresh = completed_light + _change_of_new_pixels(change, hole, weight, inverse_depth)
     blended = (fresh + weight[..., None] * (recalled - fresh)).clamp(0, 1)
@@ -243,8 +244,8 @@ def _change_of_new_pixels(
     The spread change falls to 0 at the hole's rim, and is 0 at all pixels that are not new.
 
     Args:
-        change: [H, W, 3] the previous view's linear light minus that of this view, as it was
-            completed without earlier frames.
+        change: [H, W, 3] the previous view's linear light, at this frame's exposure, minus that of
+            this view, as it was completed without earlier frames.
         hole: [H, W] bool: pixels that the base does not cover.
         weight: [H, W] of the previous view's colour; where it is over ½, a pixel is propagated.
         inverse_depth: [H, W] of the view.

@@ -180,7 +180,8 @@ def _cut_in_parts(blocks: Mask, crop: Crop, margin: int) -> list[Crop]:
     transposed_cuts = _halves_of_row_cuts(inside.T)
     column_cuts = transposed_cuts[..., [1, 0, 3, 2]]
     halves = np.concatenate([row_cuts, column_cuts])
-    # The positions count from the rectangle's corner so far, from now on from the grid's.
+    # So far, positions count from the rectangle's corner. With the corner added, they are positions
+    # in the grid.
     halves += (crop.top, crop.left, crop.top, crop.left)
 
     # Take the cut whose halves, with their margins, have the least area.

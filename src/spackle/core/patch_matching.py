@@ -132,7 +132,8 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
 
     levels: list[_Level] = []
     while True:
-        # At half the resolution, half as many pixels of blur are the same blur in the scene.
+        # The blur is given in pixels of the finest level. At half the resolution, half as many
+        # pixels are the same blur in the scene.
         tone_blur = max(TONE_BLUR_CELLS / 2 ** len(levels), MIN_TONE_BLUR_PX)
         # Two patches are compared not only by their pixels, but also by the tone and depth of their
         # centres. These traits are scaled so that their squared differences are costs.
@@ -292,7 +293,7 @@ class _LevelSearch:
             traits=level.traits,
             source_rgb=_with_mirror_image(level.rgb),
             source_traits=_with_mirror_image(level.traits),
-            # Distances count in long sides of the picture.
+            # Distances are measured in units of the picture's long side, and weighted as squares.
             distance_weight=np.float32(DISTANCE_WEIGHT / max(height, width) ** 2),
         )
 

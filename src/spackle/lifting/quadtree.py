@@ -116,6 +116,7 @@ class Quadtree:
             tile_means = [grid_means(whole_blocks, h, w) for h, w in _tile_sizes(side)]
             mean_depth = grid_means(inverse_depth, side, side)
             mean_slope = grid_means(slope, side, side)
+            # In the order of the last arguments of the kernel `_measure_losses`.
             images = (picture, *tile_means, inverse_depth, mean_depth, mean_slope, free)
             arrays = [image.contiguous().numpy() for image in images]
             losses = np.empty((rows, columns, 3), np.float32)

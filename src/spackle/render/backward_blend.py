@@ -115,6 +115,7 @@ def load_gradients(planes: Array, left: int, top: int, images: Arrays, gradients
             i = GRADIENT_PLANES + row * TILE_PX + column
             y = top + row
             x = left + column
+            # The five planes are the gradients of red, green, blue, depth (3) and alpha (4).
             for channel in range(3):
                 slope = srgb_slope(linear[y, x, channel], rgb[y, x, channel])
                 planes[i + channel * PLANE_FLOATS] = rgb_grad[y, x, channel] * slope
@@ -347,7 +348,7 @@ def step_back_row(
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
         n = note_start + np.uint64(x)
-        g = i + np.uint64(GRADIENT_PLANES)
+        g = i + np.uint64(GRADIENT_PLANES)  # in the plane of red's gradient; then green, blue, …
         # What one unit of this Gaussian's weight adds to the loss.
         value = (
             red * planes[g]

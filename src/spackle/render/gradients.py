@@ -197,7 +197,8 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
         TILES_PER_CHUNK,
     )  # fmt: skip
 
-    # Each thread adds up one share of the table's rows, so that no two write to one row.
+    # Then the sums of all tiles are added up by Gaussian. Each thread does a share of the table's
+    # rows, so that no two threads write to one row.
     table = np.zeros((count, SUMS), np.float32)
     sum_rows = entry_rows[entry_needs]  # [M]: the row of the table for each row of `sums`
     shares = thread_count()

@@ -319,7 +319,7 @@ def has_drawn_tile(
     row r and to the left of column c.
     """
     # The drawn tiles in the box's columns, counted from the image's top to the box's bottom, and to
-    # the box's top. The difference of both numbers would be that of drawn tiles in the box.
+    # the box's top. These numbers differ if a tile in between, which is one of the box, is drawn.
     above_bottom = drawn_before[bottom, right] - drawn_before[bottom, left]
     above_top = drawn_before[top, right] - drawn_before[top, left]
     return bool(above_bottom != above_top)
