@@ -228,7 +228,7 @@ class Guard:
     def _guarded(self, scope: Scope, send: Send) -> Send:
         """A `send` that adds the security headers to an answer, and logs the request `scope`.
 
-        asyncio.TimeoutError comes if the client does not read the answer.
+        It raises asyncio.TimeoutError if the client does not read the answer.
         """
 
         async def send_guarded(message: Message) -> None:

@@ -234,7 +234,8 @@ class Jobs:
         # `_own_process` holds another value in each thread.
         process: TaskProcess | None = getattr(self._own_process, "process", None)
         with self._lock:
-            # After `close`, which kills the processes, a dead one stays: its tasks fail.
+            # `close` kills the processes. A process that died after that is not replaced: it is
+            # returned dead, and the tasks that it gets fail.
             is_dead = process is not None and not process.alive
             if process is None or (is_dead and not self._is_closed.is_set()):
                 process = TaskProcess(self._work)

@@ -188,7 +188,7 @@ def random_outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
     dy = y - center_y
     dx = x - center_x
 
-    # In 35 % of cases the region of a colour, in 40 % a blob, in 25 % a bar.
+    # The shape is in 35 % of cases the region of a colour, in 40 % a blob, in 25 % a bar.
     kind = rng.random()
     if kind < 0.35:
         field = color_region(rng, picture, int(center_y), int(center_x), dx, dy) + 0.1 * cloud

@@ -217,7 +217,8 @@ def changed_keys(stored: Mapping[str, Any], recipe: RecipePart, prefix: str = ""
     fields = type(recipe).model_fields
     values = recipe.model_dump(mode="json")
 
-    # A stored key that this version does not know matters only if it had a value.
+    # A key that only the stored recipe has, from another version of the program, matters only if it
+    # had a value.
     changes = []
     for name, stored_value in stored.items():
         if name not in fields and stored_value is not None:

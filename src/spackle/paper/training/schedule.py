@@ -64,7 +64,7 @@ def samples_of_step(
         rank: the number of the process, whose samples are returned.
         ranks: number of processes; they divide each batch evenly.
     """
-    # The processes take neighbouring parts of the batch.
+    # Positions count samples over all steps. The processes take neighbouring parts of the batch.
     samples_per_rank = batch // ranks
     first = step * batch + rank * samples_per_rank
 

@@ -168,7 +168,7 @@ def dataset_source(data: DataRecipe, location: Path, *, validation: bool) -> Sou
     read_photo = lru_cache(maxsize=1)(dataset.__getitem__)
 
     def stored_view(rng: np.random.Generator, index: int) -> Sample:
-        """The dataset's view of this number; nothing is random."""
+        """The dataset's view of this number; `rng` is not used, because nothing is random."""
         photo_number, view_number = views[index]
         photo = read_photo(photo_number)
         view = photo.view(view_number)

@@ -251,7 +251,12 @@ def items_of_passes(run: TrainingRun, step: int) -> list[list[int]]:
     """Numbers of this process's items at a step, divided into passes through the network."""
     task = run.task
     items = samples_of_step(
-        step, task.items, task.items_per_step, run.recipe.run.seed, rank(), rank_count()
+        step,
+        count=task.items,
+        batch=task.items_per_step,
+        seed=run.recipe.run.seed,
+        rank=rank(),
+        ranks=rank_count(),
     )
     pass_size = task.micro_batch or len(items)  # None: all items in one pass
     return [items[start : start + pass_size] for start in range(0, len(items), pass_size)]
