@@ -147,7 +147,7 @@ class EfficientNetEncoder(nn.Module):
         features = []
         for index, stage in enumerate(self.stages):
             x = stage(x)
-            if index in FEATURE_STAGES:
+            if index in FEATURE_STAGES:  # the last stage at each of the five scales
                 features.append(x)
         return features
 

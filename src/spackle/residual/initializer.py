@@ -235,7 +235,7 @@ def place_behind_surfaces(filled: Tensor, cells: Tensor, visible: Tensor, radius
         visible: [h, w] inverse depth of visible surfaces; 0: none.
         radius: surfaces within so many rows and columns of a cell count.
     """
-    # The least inverse depth nearby, as a maximum of the negative.
+    # The least inverse depth nearby, computed as minus the maximum of the negative.
     farthest_nearby = -maximum_filter(-torch.where(visible > 0, visible, torch.inf), radius)
     # A Gaussian at exactly this depth would show through the surface, so it goes a little farther.
     behind = torch.minimum(filled, farthest_nearby) * (1 - BEHIND_SURFACE_RATIO)

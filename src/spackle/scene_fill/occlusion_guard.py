@@ -159,7 +159,8 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths
 
-    # A closing is a maximum followed by a minimum, here the maximum of the negative.
+    # A closing is a maximum followed by a minimum. The minimum is computed as minus the maximum of
+    # the negative.
     farthest = maximum_filter(grid, radius)
     closed = -maximum_filter(torch.where(cells, -farthest, -torch.inf), radius)
     return closed[cells]

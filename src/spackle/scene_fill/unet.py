@@ -169,6 +169,7 @@ class UNet(ResidualNet):
             weights[:, k : k + 1] * features[:, colors]
             for k, colors in enumerate(self.copied_colors)
         )  # [B, 3, h, w]
+        # `COLOR_DELTAS` is the slice of the colour's channels; the others stay as they are.
         return torch.cat(
             [
                 deltas[:, : COLOR_DELTAS.start],

@@ -451,7 +451,7 @@ def make_initial_gaussians(image: Tensor, depth: Tensor) -> InitialGaussians:
         disparity_map=disparity,
         disparity=max_pool2d(disparity, CELL_STRIDE)[0],
         color=avg_pool2d(image, CELL_STRIDE)[0],
-        unscale=1.0 / factor,
+        unscale=1.0 / factor,  # turns scaled depths back into metres
     )
 
 
