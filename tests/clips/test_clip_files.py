@@ -42,7 +42,7 @@ def test_uneven_times_are_kept_and_the_first_frames_may_be_all() -> None:
     clip = read_clip(CLIPS / "uneven.mkv")
     assert [round(10 * t) for t in clip.times] == [0, 1, 5, 6]
     assert float(clip.start) == pytest.approx(0.3, abs=0.01)
-    clip = read_clip(CLIPS / "uneven.mkv", first=2)
+    clip = read_clip(CLIPS / "uneven.mkv", max_frames=2)
     assert len(list(clip_frames(clip))) == len(clip) == 2
     assert float(clip.seconds) == pytest.approx(0.2, abs=0.01)
 

@@ -92,14 +92,14 @@ def is_clip(path: Path) -> bool:
 
 def read_clip(
     path: str | os.PathLike[str],
-    first: int | None = None,
+    max_frames: int | None = None,
     progress: Progress | None = None,
 ) -> Clip:
     """Decode a clip from beginning to end, so that damage in any frame is reported at once.
 
     Args:
         path: the file.
-        first: number of frames to read; all if None.
+        max_frames: number of frames to read from the beginning; None: all.
         progress: called with (number of frames read, number of frames in the file).
 
     Raises:
@@ -108,7 +108,7 @@ def read_clip(
     """
     check_file(path, "clip")
     try:
-        return _read_clip(path, first, progress)
+        return _read_clip(path, max_frames, progress)
     except InputError as error:
         message = str(error)
         cause = error.__cause__
@@ -120,8 +120,10 @@ def read_clip(
     raise InputError(message) from cause
 
 
-def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progress | None) -> Clip:
-    """Decode the first frames of a clip (None: all), and collect its facts.
+def _read_clip(
+    path: str | os.PathLike[str], max_frames: int | None, progress: Progress | None
+) -> Clip:
+    """Decode the first `max_frames` frames of a clip (None: all), and collect its facts.
 
     `progress` is called with (number of frames read, number of frames in the file). InputError if
     the file is not a clip, damaged, or has no frames.
@@ -136,7 +138,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progre
         if audio_streams and audio_streams[0].codec_context:
             audio = audio_streams[0].codec_context.name
 
-        for frame in _decode_frames(path, container, stream, first):
+        for frame in _decode_frames(path, container, stream, max_frames):
             if frame.pts is None or frame.time_base is None:
                 times_in_file.append(None)
             else:
@@ -144,7 +146,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progre
             if progress is not None:
                 frames_read = len(times_in_file)
                 # A file may state too few frames, or none.
-                progress(frames_read, max(frames_read, first or stream.frames))
+                progress(frames_read, max(frames_read, max_frames or stream.frames))
     if frame is None:
         raise InputError(f"{path}: has no frames: give another clip")
 
@@ -214,9 +216,12 @@ def _open_video(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, 
 
 
 def _decode_frames(
-    path: str | os.PathLike[str], container: InputContainer, stream: VideoStream, first: int | None
+    path: str | os.PathLike[str],
+    container: InputContainer,
+    stream: VideoStream,
+    max_frames: int | None,
 ) -> Iterator[av.VideoFrame]:
-    """Decode the first frames of a video (None: all), which must all have the same size.
+    """Decode the first `max_frames` frames of a video (None: all), all of the same size.
 
     InputError, which names `path`, if a frame is damaged or missing or has another size.
     """
@@ -241,7 +246,7 @@ def _decode_frames(
                     )
                 yield frame
                 frame_count += 1
-                if frame_count == first:
+                if frame_count == max_frames:
                     return
         # FFmpeg ends a truncated file without an error.
         if packet_count < stream.frames:

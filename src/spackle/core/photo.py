@@ -195,7 +195,8 @@ def _make_photo(
         exif: the image's EXIF tags, by number.
         path: the image's file.
         keep_frame: keep a uniform border.
-        focal_options: at most one of `focal_px`, `focal_mm` and `fov`; InputError for nonsense.
+        focal_options: at most one of `focal_px`, `focal_mm` and `fov`; InputError for an
+            impossible one.
     """
     height, width = rgb.shape[:2]
     focal, source = resolve_focal_length(path, width, height, exif, **focal_options)

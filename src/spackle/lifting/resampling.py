@@ -65,6 +65,7 @@ def resample_map(
     slope_y = np.ascontiguousarray(slope_y.T)
     rows, columns = inverse_depth.shape
 
+    # A map of the photo's size needs no interpolation.
     if (rows, columns) == (height, width):
         state = np.where(known, np.where(on_one_surface, SETTLED, OPEN), HOLE).astype(np.uint8)
         return ResampledMap(inverse_depth, state, edges.smear_height, (slope_x, slope_y))
@@ -80,7 +81,8 @@ def resample_map(
         height,
         width,
     )
-    # Slopes are taken from the map pixel that the photo's pixel lies in, by pixel of the photo.
+    # Each pixel of the photo takes the slope of the map pixel (y, x) in which it lies. That is a
+    # change from one map pixel to the next; the ratio of the sizes makes it one by photo pixel.
     y = ((np.arange(height) + 0.5) * rows / height).astype(int)
     x = ((np.arange(width) + 0.5) * columns / width).astype(int)
     slope = (

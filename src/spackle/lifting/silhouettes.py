@@ -65,7 +65,7 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
     both_depths = np.stack([inverse_depth, inverse_depth])
     both_slopes = np.stack([slope, slope])
     both_colors = np.stack([colors, colors])
-    inside, variance = estimate_surfaces(
+    outline_distance, variance = estimate_surfaces(
         inverse_depth, colors, ring, side_depths, both_depths, both_slopes, both_colors
     )
 
@@ -73,13 +73,13 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
     alpha = np.zeros((height, width), np.float32)
     parallel_for_chunks(
         lambda start, stop: _fit_coverage(
-            start, stop, colors, ring, inside, both_colors, variance, alpha
+            start, stop, colors, ring, outline_distance, both_colors, variance, alpha
         ),
         height,
     )
 
     # … and last colours that give exactly the photo with this coverage.
-    _unmix(colors, ring, inside, alpha, both_colors, variance)
+    _unmix(colors, ring, outline_distance, alpha, both_colors, variance)
     return Layers(ring, alpha, both_depths, both_slopes, both_colors)
 
 
@@ -117,7 +117,7 @@ def _fit_coverage(
     stop: int,
     photo: Any,
     ring: Any,
-    inside: Any,
+    outline_distance: Any,
     surface_colors: Any,
     variance: Any,
     alpha: Any,
@@ -131,7 +131,8 @@ def _fit_coverage(
         start, stop: the rows to do.
         photo: [H, W, 3] the photo in linear RGB.
         ring: [H, W] uint8: distance to the nearest depth step, or 0.
-        inside: [H, W] distance from the near surface's outline in the map, in pixels.
+        outline_distance: [H, W] distance from the near surface's outline in the map, in pixels;
+            positive inside of it, negative outside.
         surface_colors: [2, H, W, 3] mean colours of the near and the far surface.
         variance: [2, H, W] their variances.
         alpha: [H, W]: the coverage, 0..1, of pixels in a ring is written here.
@@ -156,7 +157,7 @@ def _fit_coverage(
                     weight = contrast / max(spread, MIN_SQUARED_CONTRAST)
                     for k in range(len(costs)):
                         shift_px = (k % shifts - SHIFTS_EACH_WAY) * SHIFT_STEP_PX
-                        a = 0.5 + (inside[v, u] + shift_px) / RAMP_WIDTHS_PX[k // shifts]
+                        a = 0.5 + (outline_distance[v, u] + shift_px) / RAMP_WIDTHS_PX[k // shifts]
                         error = min(max(a, 0.0), 1.0) - share
                         costs[k] += weight * error * error
 
@@ -170,7 +171,10 @@ def _fit_coverage(
                 bend = costs[best - 1] - 2 * costs[best] + costs[best + 1]
                 if bend > 0:
                     shift += 0.5 * (costs[best - 1] - costs[best + 1]) / bend
-            coverage = 0.5 + (inside[y, x] + shift * SHIFT_STEP_PX) / RAMP_WIDTHS_PX[best // shifts]
+            coverage = (
+                0.5
+                + (outline_distance[y, x] + shift * SHIFT_STEP_PX) / RAMP_WIDTHS_PX[best // shifts]
+            )
             alpha[y, x] = min(max(coverage, 0.0), 1.0)
 
 
@@ -212,20 +216,21 @@ def _move_colors(y: int, x: int, a: Any, residual: Any, surface_colors: Any, var
 
 @kernel
 def _unmix(
-    photo: Any, ring: Any, inside: Any, alpha: Any, surface_colors: Any, variance: Any
+    photo: Any, ring: Any, outline_distance: Any, alpha: Any, surface_colors: Any, variance: Any
 ) -> None:
     """Change both colours so that they mix to the photo's colour, as far as they may.
 
     A colour may move by 1.5 standard deviations of its surface's colours. If that allows no exact
     mixture, the colours stay unchanged, and alpha gives the closest one. A pixel far from any
-    mixture, such as the shaded edge of a round object, belongs to one surface alone. The fringe of
-    a sharpening camera along an outline counts as the near surface, because it would stay visible
-    on the background.
+    mixture, such as the shaded edge of a round object, belongs to one surface alone. A camera's
+    sharpening makes a fringe along an outline. It counts as the near surface, because on the
+    background it would be visible as a line when the near object has moved away from it.
 
     Args:
         photo: [H, W, 3] the photo in linear RGB.
         ring: [H, W] uint8: distance to the nearest depth step; pixels with 0 are left alone.
-        inside: [H, W] distance from the near surface's outline in the map, negative outside.
+        outline_distance: [H, W] distance from the near surface's outline in the map, in pixels;
+            positive inside of it, negative outside.
         alpha: [H, W] coverage by the near surface, changed in place.
         surface_colors: [2, H, W, 3] near and far colour, changed in place.
         variance: [2, H, W] of each surface's colours.
@@ -254,7 +259,7 @@ def _unmix(
                 residual[c] = photo[y, x, c] - (a * unchanged[0, c] + (1 - a) * unchanged[1, c])
 
             unexplained = _move_colors(y, x, a, residual, surface_colors, variance)
-            if inside[y, x] <= 0 and is_fringe:
+            if outline_distance[y, x] <= 0 and is_fringe:
                 alpha[y, x] = 1
                 continue
             if unexplained <= MAX_UNEXPLAINED:  # the new colours explain the pixel
@@ -268,4 +273,4 @@ def _unmix(
                     surface_colors[0, y, x, c] = unchanged[0, c]
                     surface_colors[1, y, x, c] = unchanged[1, c]
             else:
-                alpha[y, x] = 1 if inside[y, x] > 0 else 0
+                alpha[y, x] = 1 if outline_distance[y, x] > 0 else 0

@@ -126,22 +126,22 @@ def estimate_surfaces(
         negative outside. [2, H, W]: the variance of each surface's colours.
     """
     height, width = inverse_depth.shape
-    inside = np.zeros((height, width), np.float32)
+    outline_distance = np.zeros((height, width), np.float32)
     variance = np.zeros((2, height, width), np.float32)
     parallel_for_chunks(
         lambda start, stop: _estimate_surfaces(
             start, stop, inverse_depth, colors, rings, side_depths,
-            inside, depth, slope, color, variance,
+            outline_distance, depth, slope, color, variance,
         ),
         height,
     )  # fmt: skip
-    return inside, variance
+    return outline_distance, variance
 
 
 @kernel
 def _estimate_surfaces(
     start: int, stop: int, image: Any, colors: Any, rings: Any, side_depths: Any,
-    inside: Any, depth: Any, slope: Any, color: Any, variance: Any,
+    outline_distance: Any, depth: Any, slope: Any, color: Any, variance: Any,
 ) -> None:  # fmt: skip
     """Estimate the near surface (index 0) and the far one (1) at each ring pixel of some rows.
 
@@ -151,7 +151,7 @@ def _estimate_surfaces(
         colors: [H, W, 3] linear RGB.
         rings: [H, W] uint8: distance to the nearest step, or 0.
         side_depths: [H, W, 2]: inverse depths on both sides of a step, in the first ring.
-        inside: [H, W]: the distance from the near surface's outline is written here.
+        outline_distance: [H, W]: the distance from the near surface's outline is written here.
         depth, slope, color: [2, H, W, …] of both surfaces, written here.
         variance: [2, H, W]: sum of the variances of the colour channels, written here.
     """
@@ -177,7 +177,7 @@ def _estimate_surfaces(
             near_share = _sum_window(
                 y, x, image, colors, rings, high, low, surface_depths, depth_moments, color_moments
             )
-            inside[y, x] = _outline_distance(near_share, is_near)
+            outline_distance[y, x] = _outline_distance(near_share, is_near)
 
             for side in range(2):
                 # A pixel of the near surface gets a fitted plane for both surfaces, because the map
