@@ -276,6 +276,7 @@ def _recolored(aux: Gaussians, camera: Camera, change: Tensor, weight: Tensor) -
     """
     weighted = torch.cat([change * weight[..., None], weight[..., None]], dim=-1)  # [H, W, 4]
     cell_means = avg_pool2d(weighted.permute(2, 0, 1)[None], CELL, ceil_mode=True)[0]  # [4, h, w]
+    # The mean of change times weight, divided by the mean weight, is the weighted mean.
     mean_change = cell_means[:3] / cell_means[3:].clamp_min(1e-6)
 
     uv, _ = camera.project(aux.means)

@@ -74,7 +74,8 @@ def exp2(x: np.float32) -> np.float32:
 def natural_log(x: np.float32) -> float:
     """The logarithm of a positive float32, accurate to the last digits of float64."""
     # x = 2^exponent · m with m from sqrt(1/2) to sqrt(2): split the float's bits, which are the
-    # exponent followed by the mantissa.
+    # exponent followed by the mantissa. The bits of sqrt(1/2) are subtracted first, so that the
+    # exponent steps up at sqrt(1/2), sqrt(2), … and not at powers of 2.
     bits = np.float32(x).view(np.int32)
     exponent = (bits - ROOT_HALF_BITS) >> MANTISSA_BITS
     m = np.float64(np.int32(bits - (exponent << MANTISSA_BITS)).view(np.float32))

@@ -49,6 +49,8 @@ def draw_with_gradients(
         drawn_tiles: [rows, columns] bool: the tiles of 16×16 pixels to draw.
         background: a rendering whose copy fills all other tiles; None: they are black and empty.
     """
+    # Autograd takes all tensors as one flat sequence: three images, or None for each, and then the
+    # five fields of each set.
     background_images: list[Tensor | None] = [None] * IMAGES
     if background is not None:
         background_images = [image.float() for image in background.tensors]

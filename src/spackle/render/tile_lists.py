@@ -66,8 +66,8 @@ def count_entries(
     """Count how many Gaussians of each part are in each tile's list.
 
     Args:
-        first, last: the parts first..last (exclusive) are counted; part k has the Gaussians from
-            k·part_size on.
+        first, last: the parts first..last (exclusive) are counted; part k has `part_size` Gaussians
+            from the index k·part_size on.
         part_size: Gaussians in a part.
         boxes: [N, 4] uint16: the tiles that each Gaussian may touch, as first column, last column,
             first row, last row (last exclusive).
