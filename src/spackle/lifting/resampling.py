@@ -223,8 +223,8 @@ def _resample_pixel(
     mixed_sum = 0.0
     plane_sum = 0.0
     weight_sum = 0.0  # of all four
-    # Of the closest map pixel outside of smeared edges: its depth, extended to this position, and its
-    # distance in pixels of the photo.
+    # Of the closest map pixel outside of smeared edges: its depth, extended to this position, and
+    # its distance in pixels of the photo.
     covered_depth = np.float32(0)
     covered_distance = np.inf
     for k in range(4):

@@ -101,8 +101,8 @@ def layered_gaussians(
         ]
     )
 
-    # Pixels that touch a step (`ring` 1) or the border keep their colours. There, a correction would
-    # make up for the light of Gaussians around, and be a visible ghost once the camera moves.
+    # Pixels that touch a step (`ring` 1) or the border keep their colours. There, a correction
+    # would make up for the light of Gaussians around, and be a visible ghost once the camera moves.
     correctable = without_border(ring != 1)[single]
     samples = _correct_colors(samples, colors, single, correctable, tiles)
     return make_surfels(camera, *samples)
@@ -172,9 +172,8 @@ def _correct_colors(
     """
     height, width = single.shape
     nearest_first = samples.inverse_depth.argsort(descending=True, stable=True)
-    screen_gaussians = torch.cat(
-        [samples.uv, samples.sigma, samples.opacity[:, None]], dim=-1
-    )  # [N, 5]
+    # [N, 5]
+    screen_gaussians = torch.cat([samples.uv, samples.sigma, samples.opacity[:, None]], dim=-1)
     spots = screen_gaussians[nearest_first].numpy()
     corrected = samples.color.clone()
     # Each sweep adds what the blended picture lacks. Neighbours overlap, so that one is not enough.

@@ -169,7 +169,8 @@ def _estimate_surfaces(
             high, low = _closest_step(y, x, rings, side_depths)
             middle = np.float32(0.5) * (high + low)
             is_near = image[y, x] > middle
-            # The pixel's own surface has the pixel's depth, the other one that of its side of the step.
+            # The pixel's own surface has the pixel's depth, the other one that of its side of the
+            # step.
             surface_depths[0] = high
             surface_depths[1] = low
             surface_depths[0 if is_near else 1] = image[y, x]

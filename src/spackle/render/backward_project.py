@@ -37,9 +37,9 @@ def project_backward(
             colors [n, 3].
         camera: the view.
         table: [n, 10] sums over pixels: with the offset (dx, dy) from the centre,
-            u = dx - slope·dy and v = ∂L/∂ln(alpha) the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy; then the gradients of
-            red, green, blue and depth. A row of zeros belongs to an invisible Gaussian, which gets
-            no gradients.
+            u = dx - slope·dy and v = ∂L/∂ln(alpha) the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy;
+            then the gradients of red, green, blue and depth. A row of zeros belongs to an invisible
+            Gaussian, which gets no gradients.
         gradients: of the arrays of `scene`, of the same shapes, zero at first; written here.
     """
     means, quats, scales, opacities, _ = scene

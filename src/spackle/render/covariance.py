@@ -126,8 +126,9 @@ def covariance_factor(jacobian: Numbers, pose: Array, rotation: Numbers, scale: 
 def widened_covariance(factor: Numbers, eps2d: float) -> Numbers:
     """The covariance M Mᵀ + eps2d·I in pixels² as (xx, xy, yy, determinant).
 
-    `factor` has the two rows m and n of M, one after the other. The determinant of M Mᵀ is the squared cross product of these
-    rows (Cauchy–Binet), which is exact also for a Gaussian that is seen edge-on.
+    `factor` has the two rows m and n of M, one after the other. The determinant of M Mᵀ is the
+    squared cross product of these rows (Cauchy–Binet), which is exact also for a Gaussian that is
+    seen edge-on.
     """
     m0, m1, m2, n0, n1, n2 = factor
     cxx = m0 * m0 + m1 * m1 + m2 * m2

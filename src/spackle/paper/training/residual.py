@@ -183,9 +183,9 @@ def complete_samples(
     """
     device = renderer.device
 
-    # The cells that get a new Gaussian (at least MIN_AUX_GAUSSIANS cells a view), and the renderer's
-    # tiles that these Gaussians can touch. They are read before the samples move to the renderer's
-    # device, because reading them there would wait for a GPU.
+    # The cells that get a new Gaussian (at least MIN_AUX_GAUSSIANS cells a view), and the
+    # renderer's tiles that these Gaussians can touch. They are read before the samples move to the
+    # renderer's device, because reading them there would wait for a GPU.
     cells = [
         sample.view.cells(MIN_AUX_GAUSSIANS).flatten().nonzero()[:, 0].to(device, non_blocking=True)
         for sample in samples

@@ -46,7 +46,7 @@ class Task(Protocol):
         """
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The groups of weights that the optimiser trains: here one, all weights with requires_grad.
+        """The groups of weights that the optimiser trains: one, all that have requires_grad.
 
         A group is {"params": [weights]}, and may have an "lr_scale", a factor on the learning rate.
         """

@@ -233,8 +233,8 @@ def accumulate_gradients(run: TrainingRun, batches: Iterator[Any]) -> dict[str, 
     for number, items in enumerate(passes, 1):
         weight = len(items) * rank_count() / run.task.items_per_step
 
-        # `run.wrapped` is the network in a wrapper that averages the gradients of all processes. Once
-        # a step is enough, so only the last pass lets them communicate.
+        # `run.wrapped` is the network in a wrapper that averages the gradients of all processes.
+        # Once a step is enough, so only the last pass lets them communicate.
         communication: contextlib.AbstractContextManager[Any] = contextlib.nullcontext()
         if rank_count() > 1 and number < len(passes):
             communication = run.wrapped.no_sync()  # type: ignore[operator]
