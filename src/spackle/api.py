@@ -137,6 +137,8 @@ class Spackle:
 
         # Temporary files of photo and depth have to exist until the scene is complete, because the
         # base reads them late.
+        # A uniform frame around the picture is cropped, unless the user wants it, or gives depth or
+        # cameras: these belong to the whole picture, frame included.
         with contextlib.ExitStack() as open_files:
             if depth is not None:
                 depth_source = open_files.enter_context(_open_depth(depth, depth_kind))

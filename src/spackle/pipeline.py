@@ -71,7 +71,7 @@ class FillOptions:
     @property
     def weights_name(self) -> str:
         """The name of the network's weights in reports: "shipped", a file, "initial" or "none"."""
-        if self.texture == "none":
+        if self.texture == "none":  # no hole is filled, so no weights are used
             return "none"
         if self.residual is not None:
             return self.residual

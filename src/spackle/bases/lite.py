@@ -404,6 +404,8 @@ class LiteBase:
         # If the file of weights holds only the first network, the second one's scale is left out.
         scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
         log_inverse_depths = self.at_scales(rgb, scales)
+        # Maps of coarse inputs are right at large, those of fine inputs in detail: the merged map
+        # takes its low frequencies from the scales that are marked for it.
         gives_low_frequencies = [scale.gives_low_frequencies for scale in scales]
         return merge_outputs(log_inverse_depths, gives_low_frequencies).exp()
 

@@ -91,8 +91,8 @@ def page_scene(
         disparity: how far to the side the camera may go, because the holes that it uncovers are
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal. The
             page's camera goes no farther. None if it is not known.
-        note: a text for the user; empty for none. The page shows it for some seconds, and what
-            stands before its first semicolon always.
+        note: a text for the user; empty for none. The page shows the whole text for some seconds,
+            and then only its beginning, up to the first semicolon.
 
     Raises:
         InputError: no Gaussian lies in front of the camera.

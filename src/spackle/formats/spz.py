@@ -306,11 +306,12 @@ def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
     largest, others = encode_smallest_three(xyzw)  # [N], [N, 3]
     # Sizes are multiples of this step, so that the lower of the nine bits are 0.
     step = 2 ** (9 - component_bits)
+    # The components that are not the largest are at most 1/√2, which gets the largest code.
     code_per_component = np.float32(MAX_COMPONENT_CODE * 2**0.5 / step)
     rounded = np.round(np.abs(others) * code_per_component) * step
     sizes = np.minimum(MAX_COMPONENT_CODE, rounded).astype("<u4")
     is_negative = (others < 0) & (sizes > 0)  # zero has no sign, so that equal values stay equal
-    codes = sizes | is_negative.astype("<u4") << 9  # [N, 3]; the sign is above the nine bits
+    codes = sizes | (is_negative.astype("<u4") << 9)  # [N, 3]; the sign is above the nine bits
 
     # The index of the largest component ends up in the two highest of the 32 bits.
     words: NDArray[np.uint32] = largest.astype("<u4")

@@ -215,10 +215,15 @@ def _outline_distance(near_share: Any, is_near: bool) -> Any:
 
 @kernel
 def _closest_step(y: int, x: int, rings: Any, side_depths: Any) -> Any:
-    """The inverse depths (near, far) on both sides of the depth step closest to a pixel.
+    """The inverse depths on both sides of the depth step closest to a pixel: (near, far).
 
-    `rings` [H, W] has the distance to the nearest step, and `side_depths` [H, W, 2] both sides'
-    inverse depths in the first ring.
+    Near surfaces have high inverse depths, and far ones low.
+
+    Args:
+        y, x: the pixel.
+        rings: [H, W] distance to the nearest step in pixels: 1 in the pixels that touch a step.
+        side_depths: [H, W, 2] for pixels that touch a step, the inverse depths on its near and its
+            far side.
     """
     height, width = rings.shape
     high = np.float32(0)

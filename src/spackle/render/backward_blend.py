@@ -430,12 +430,16 @@ def step_back_and_sum_row(
 
 @kernel
 def collect_sums(first_row: int, last_row: int, sum_rows: Array, sums: Array, table: Array) -> None:
-    """Add the sums of all tiles to one row for each Gaussian, for some rows of the table.
+    """Add the gradients that all tiles give to a Gaussian in the Gaussian's row of the table.
+
+    Several threads do this at once, each for its own rows of the table, so that no two threads
+    write to one row. Each thread therefore looks through all rows of `sums`.
 
     Args:
-        first_row, last_row: the rows first_row..last_row (exclusive) of the table are written.
+        first_row, last_row: this thread's rows of the table, first_row..last_row (exclusive).
         sum_rows: [M]: the row of the table to which each row of `sums` belongs.
-        sums: [M, 10] float32, in the order of tiles.
+        sums: [M, 10] float32, in the order of tiles: for a Gaussian in a tile, the sums over the
+            tile's pixels from which its gradients follow.
         table: [G, 10] float32, zero at first.
     """
     for k in range(len(sum_rows)):

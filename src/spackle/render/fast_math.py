@@ -94,8 +94,8 @@ def encode_srgb(linear: np.float32) -> np.float32:
     """Convert linear light to sRGB, both clamped to 0..1; error 1e-6."""
     value = min(max(linear, ZERO), ONE)
 
-    # sRGB's power, by a polynomial with the coefficients S0 to S8 in t. This is the fourth root of
-    # the linear value, moved to -1..1, in which the curve is nearly straight.
+    # As a function of the fourth root of the linear value, sRGB's power curve is nearly straight.
+    # So t is this root, moved to -1..1, and the curve is S0 + S1·t + … + S8·t⁸.
     t = (np.sqrt(np.sqrt(value)) - ROOT_MIDDLE) / ROOT_SPREAD
     curve = S0 + t * (S1 + t * (S2 + t * (S3 + t * (S4 + t * (S5 + t * (S6 + t * (S7 + t * S8)))))))
     return SRGB_LINE * value if value <= SRGB_KNEE else min(curve, ONE)

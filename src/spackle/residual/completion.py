@@ -208,7 +208,7 @@ def view_type_of(
     """The class that completes views for a network, and computes the inputs that it names.
 
     A network whose inputs need a class of their own states it as `view_type`; for all others, and
-    without a network, the class is `default`.
+    without a network, the class is `default`, usually `ViewCompletion`.
     """
     if network is None or network.view_type is None:
         return default

@@ -295,8 +295,9 @@ def save_planned_video(
     def render_frames() -> Iterator[Tensor]:
         """Each frame [H, W, 3] sRGB, as the encoder asks for it: uint8, or floats in 0..1."""
         for frame_index, eye_views in enumerate(views.frames):
-            # The fill keeps the uint8 picture of a view that was complete when it rendered it. It
-            # keeps pictures only if each frame is one view, so the first eye's view is the frame.
+            # While it filled holes, the fill has rendered some views of the finished scene, and
+            # kept their pictures. There are such pictures only for videos with one eye, so the
+            # first eye's view is the whole frame.
             picture = completed.filled.pictures.get(eye_views[0])
             if picture is not None:
                 yield picture

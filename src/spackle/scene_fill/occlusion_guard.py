@@ -233,7 +233,8 @@ def _hides_surface(
     u = camera[0] * tan_u + camera[2]
     v = camera[1] * tan_v + camera[3]
 
-    # A cheap test with the greatest reach that counts, then one with the Gaussian's own reach.
+    # Is the Gaussian in the picture at all? A cheap test takes the largest reach that any Gaussian
+    # is given, a second one the reach of this Gaussian.
     if u < -MAX_REACH_PX or v < -MAX_REACH_PX:
         return False
     if u > width + MAX_REACH_PX or v > height + MAX_REACH_PX:
@@ -243,8 +244,8 @@ def _hides_surface(
     if u < -reach_u or v < -reach_v or u > width + reach_u or v > height + reach_v:
         return False
 
-    # A depth of the guard is the greatest within a window around its pixel. So it is enough to look
-    # at pixels whose windows touch, from end to end of the Gaussian.
+    # Each depth of the guard is the greatest within a window around its pixel. So not every pixel
+    # that the Gaussian covers has to be looked at: pixels one window apart see all of it.
     spacing_px = 2 * WINDOW_RADIUS_PX
     steps_u = int(np.ceil(max(reach_u - WINDOW_RADIUS_PX, 0.0) / spacing_px))
     steps_v = int(np.ceil(max(reach_v - WINDOW_RADIUS_PX, 0.0) / spacing_px))

@@ -70,7 +70,8 @@ def exemplar_texture(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     pixel_gain = ungroup_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))
 
     # The picture without texture: smooth colours in the hole; elsewhere what was rendered.
-    smooth = group_by_cell(_interpolate_cells(continue_border(view, structure), view.mask))
+    structure_to_border = continue_border(view, structure)
+    smooth = group_by_cell(_interpolate_cells(structure_to_border, view.mask))
     in_hole = view.mask[..., None, None, None]
     picture = ungroup_cells(torch.where(in_hole, smooth, rendered))
     return texture.mul_(pixel_gain).add_(picture)

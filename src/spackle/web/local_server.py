@@ -228,7 +228,8 @@ def run_server(
             without a token.
     """
     with (
-        # single_process: a second Ctrl-C ends the program at once.
+        # The server is one process, which alone gets Ctrl-C: so a second Ctrl-C, by somebody who
+        # does not want to wait, may end it at once.
         catch_stop_signals(single_process=True) as is_stopping,
         open_listener(address.host, address.port) as listener,
         log_jobs_to(reporter),

@@ -91,7 +91,8 @@ def load_strict(
 
 def to_channels_last(network: nn.Module) -> None:
     """Convert a network's kernels to the memory format channels-last, which is faster on a CPU."""
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
+    # The stubs of torch lack this overload.
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def check_tensors(
@@ -258,7 +259,8 @@ def _read_any_format(path: StrPath) -> dict[str, Tensor]:
         return tensors_in_tree(read_archive(path))
     if _is_safetensors(signature):
         with safe_open(path, framework="pt") as opened:
-            return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # no dict
+            names = opened.keys()  # what was opened is not a dictionary
+            return {name: opened.get_tensor(name) for name in names}
     if signature.startswith(PICKLE_SIGNATURE):
         return _read_old_pickle(path)
     raise ValueError("neither safetensors nor PyTorch's format")

@@ -252,7 +252,8 @@ class SharpNetwork(nn.Module):
                 transformer at once.
             progress: called with the number of windows done and that of all windows.
         """
-        depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
+        predictor = self.monodepth_model.monodepth_predictor
+        depth_network: DepthNetwork = predictor  # type: ignore[assignment]
         encoder_maps = depth_network.encoder(image * 2 - 1, windows_per_batch, progress)
         # The network predicts canonical disparity, which is focal length / width / depth: it cannot
         # know the focal length.

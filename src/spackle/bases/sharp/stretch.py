@@ -66,6 +66,11 @@ def stretch_chunk(
 ) -> None:
     """Stretch Gaussians start..stop by the factors `stretch` (x, y, z), block by block in float64.
 
+    A stretched Gaussian has the covariance M Mᵀ, where M = stretch · rotation · scales (3 × 3). Its
+    new rotation and scales come from the singular values of M, by the one-sided Jacobi method:
+    rotations from the right make the columns of M orthogonal. Their directions are then the new
+    axes, and their lengths the new scales.
+
     quats [N, 4] (w, x, y, z) and scales [N, 3] are read; rows start..stop of new_quats [N, 4] and
     new_scales [N, 3] are written.
     """
@@ -210,8 +215,9 @@ def _store_block(first: int, count: int, block: Any, new_quats: Any, new_scales:
 def _other_axes(a: Any, b: Any) -> Any:
     """The second and third axis of a right-handed frame whose first axis is the unit vector `a`.
 
-    The second axis is the unit vector `b`, made orthogonal to `a`. If b is zero, or far from
-    orthogonal to `a`, it is mere rounding noise: then any orthogonal axis is taken.
+    The second axis is the unit vector `b`, made orthogonal to `a`. The caller's axes are orthogonal
+    but for rounding. So if b is zero, or far from orthogonal to `a`, its Gaussian is flat in this
+    direction and rounding has decided where b points: then any orthogonal axis is as good.
     """
     # The squared length of the vector product of two unit vectors is the squared sine of their
     # angle: 1 if they are orthogonal. `not … >` is also true for NaN.

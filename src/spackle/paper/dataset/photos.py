@@ -99,10 +99,11 @@ def find_coco_photos(
 
 
 def read_coco_names(source: Path) -> list[str]:
-    """The names of the photos in a COCO file; InputError if it is none, names none or a bad one.
+    """The names of the photos that a file of COCO annotations lists.
 
-    A name that is absolute or leads out of the folder of photos is bad: the file may be a
-    stranger's.
+    Raises:
+        InputError: the file has no COCO annotations, or lists no photos; or a name is absolute or
+            leads out of the folder of photos, which a stranger's file may try.
     """
     with as_input_error(
         source, 'neither a folder nor COCO annotations {"images": [{"file_name": …}, …]}: {reason}'

@@ -188,8 +188,8 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
         prediction,
         views.cameras,
         exact=True,  # only these views will be rendered, and no views between them
-        network=None,  # the Gaussians stay as they are before a network changes them
-        fill="network",  # the kind of fill that copies no texture from elsewhere in the picture
+        network=None,  # no network changes the first guess of the Gaussians in the holes
+        fill="network",  # the name for "add no texture to the colours of these Gaussians"
         renderer=renderer,
     )
     added = completed_scene.aux  # the Gaussians in the holes

@@ -402,18 +402,18 @@ def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, li
 def _time_rows(
     layout: TableLayout, settings: Sequence[str], means: Mapping[str, Sequence[Measurement]]
 ) -> list[RowTexts]:
-    """The rows of times below a table of costs.
+    """The rows with times, which stand below the rows with counts of Gaussians in a table.
 
     The first row is a heading. Then each kind of time, such as the base's time, has a group of
     rows, one for each method.
 
     Args:
-        layout: the table of costs; each setting has a column for each of `layout.columns`.
+        layout: the table; each setting has a column for each of `layout.columns`.
         settings: disparities (sizes of camera moves), as text.
         means: for each row's name the numbers of all datasets.
     """
-    # The heading is a row with a text in its first column only. All others are empty: the column of
-    # methods and the columns of counts. In the rows after it, times stand in the columns of counts.
+    # The heading has a text in its first column. The other columns stay empty: one for the methods,
+    # and those of the counts, in which the rows below the heading have their times.
     count_columns = len(layout.columns) * len(settings)
     rows: list[RowTexts] = [("Runtime efficiency", *[NO_NUMBER] * (1 + count_columns))]
 

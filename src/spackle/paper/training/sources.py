@@ -290,7 +290,10 @@ def reverse_view_by_number(
     data: DataRecipe,
     renderer: Renderer,
 ) -> Sample:
-    """A random training view whose holes are what a virtual camera does not see of a photo.
+    """A random training view with holes whose true content is known.
+
+    Its holes are the parts of a photo that a camera at another place, drawn at random, could not
+    see. The view is that of the photo itself, so the photo shows what belongs in the holes.
 
     A `Source` of training views calls this with a random generator and the view's number `index`.
     The number is not used, because `rng` alone determines the view.
@@ -304,9 +307,10 @@ def random_reverse_view(
     disparity_range: tuple[float, float],
     renderer: Renderer,
 ) -> Sample:
-    """A training view whose holes are what a virtual camera does not see of a random photo.
+    """A training view with holes whose true content is known, from a random photo.
 
-    The photo is the target. The virtual camera is a random frame of a random camera path.
+    Its holes are the parts of the photo that a virtual camera, a random frame of a random camera
+    path, does not see. The photo is the target, because it shows what belongs in the holes.
 
     Args:
         rng: source of all random choices.
