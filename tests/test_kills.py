@@ -20,6 +20,7 @@ import pytest
 from helpers.dataset_builds import SHORT, write_inputs
 from helpers.evaluation_data import write_boxes
 from helpers.photos import write_depth, write_photo
+from helpers.systems import needs_posix_signals
 from helpers.training_runs import assert_same_weights
 
 Words = list[object]
@@ -96,6 +97,7 @@ def same_files(one: Path, other: Path) -> None:
     assert [name for name in mine if mine[name] != yours[name]] == []
 
 
+@needs_posix_signals
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "same"),

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.command import Run, names_in, run
+from helpers.systems import needs_posix_signals
 from helpers.training_runs import (
     assert_same_weights,
     killed_at,
@@ -251,6 +252,7 @@ def test_the_loss_falls_on_pictures_that_are_seen_again_and_again(
 # Going on -----------------------------------------------------------------------------------------
 
 
+@needs_posix_signals
 def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
