@@ -112,5 +112,5 @@ def _python() -> str:
     ]
     first = ["predict", "Scene", "complete"]
     for name in [*first, *(name for name in spackle.__all__ if name not in first)]:
-        parts.append(f"::: {spackle._HOMES[name]}.{name}\n")
+        parts.append(f"::: {spackle._MODULE_OF_NAME[name]}.{name}\n")
     return "\n".join(parts)
