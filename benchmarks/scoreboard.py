@@ -146,14 +146,16 @@ FILL: dict[str, dict[str, Replace]] = {
     "far bias": {"fill_from_far_side": unbiased},
     "network": {"shipped_network": lambda own: lambda: None},
     "texture": {"open_texture": lambda own: lambda fill: None},
-    "half texture": {"_in_proportion": lambda own: lambda *given: 0.5 * own(*given)},
-    "sharpened": {"sharpened": first},
+    "half texture": {"_gain_to_surroundings": lambda own: lambda *given: 0.5 * own(*given)},
+    "sharpened": {"sharpen_for_overlap": first},
     "beyond_border": {"fill_around": filled_from_around},
     "in proportion": {
-        "_in_proportion": lambda own: lambda fine, view: torch.ones_like(view.features.alpha)
+        "_gain_to_surroundings": lambda own: (
+            lambda texture, view: torch.ones_like(view.features.alpha)
+        )
     },
-    "in front": {"network.ALIKE": lambda own: math.inf},
-    "extended": {"extended": lambda own: lambda view: view.structure},
+    "in front": {"view_completion.NEARER_SURFACE_RATIO": lambda own: math.inf},
+    "extended": {"continue_border": lambda own: lambda view, structure: structure},
 }
 MECHANISMS = (*FILL, *LIFT)
 
