@@ -324,8 +324,9 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["data.scales=[]"], "data.scales: tuple should have at least 1 item"),
         (["data.scales=[0]"], "data.scales.0: input should be greater than or equal to 0.1, not 0"),
         (["network=lite1"], "network: input should be 'lite0' or 'lite2', not 'lite1'"),
-        (["data.photo=x"], "data.photo: there is no such key"),
-        (["loss.features=none"], "loss.features: there is no such key"),
+        (["data.photo=x"], "data.photo: there is no such key: did you mean data.photos?"),
+        (["loss.features=none"], "loss.features: there is no such key: there are "),
+        (["optim.learning_rate=1"], "did you mean optim.lr?"),
         (["optim.frozen=8"], "optim.frozen: input should be less than or equal to 7, not 8"),
         (["optim.batch=0"], "optim.batch"),
         (

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
+import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from typing import Any
+
+from spackle.runtime.suggestions import closest_name
 
 MAX_MESSAGE_LENGTH = 300  # characters of a message that may quote a program's values
 MAX_REASON_LENGTH = 200  # characters of a library's message that ours quotes
@@ -52,9 +54,22 @@ def first_validation_problem(error: Any) -> str:
         # In these cases, pydantic's "input" is the whole object instead of the refused value.
         if first["type"] not in ("missing", "json_invalid", "too_long", "too_short"):
             problem += f", not {short_repr(first['input'])}"
+        if first["type"] == "literal_error":
+            problem += _suggested_value(first)
 
     key = ".".join(str(name)[:MAX_VALUE_LENGTH] for name in first["loc"])
     return f"{key}: {problem}" if key else problem
+
+
+def _suggested_value(problem: Any) -> str:
+    """A question such as ": did you mean resnet50?" about a text that is none of a few values.
+
+    It is empty if no value is similar. `problem` is an entry of pydantic's list of errors.
+    """
+    # Pydantic gives the values as a text: "'resnet50', 'squeezenet' or 'none'".
+    values = re.findall(r"'([^']*)'", problem["ctx"]["expected"])
+    suggestion = closest_name(str(problem["input"]), values)
+    return "" if suggestion is None else f": did you mean {suggestion}?"
 
 
 @contextlib.contextmanager
@@ -125,8 +140,7 @@ def check_name(option: str, name: str, known: Iterable[str]) -> None:
     if name in names:
         return
     problem = f"`{option}` {name} is unknown"
-    # A name with less than half of the letters in common is no typing error.
-    similar = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    if similar:
-        raise InputError(f"{problem}: did you mean {similar[0]}? There are {', '.join(names)}")
+    suggestion = closest_name(name, names)
+    if suggestion is not None:
+        raise InputError(f"{problem}: did you mean {suggestion}? There are {', '.join(names)}")
     raise InputError(f"{problem}: there are {', '.join(names)}")

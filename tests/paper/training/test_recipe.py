@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
 
-from spackle.paper.training.recipe import OptimRecipe, Recipe, RgbdFolder, changed_keys, load_recipe
+from spackle.paper.training.recipe import (
+    OptimRecipe,
+    Recipe,
+    RgbdFolder,
+    changed_keys,
+    load_recipe,
+    set_nested,
+)
 from spackle.paper.training.schedule import ema_decay, learning_rate, samples_of_step
 from spackle.runtime.errors import InputError
 from spackle.weights import published_weights
@@ -115,6 +123,67 @@ def test_bad_values_are_named(
     assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="cpus: no such recipe"):
         load_recipe(Recipe, "cpus")
+
+
+@pytest.mark.parametrize(
+    ("key", "meant"),
+    [
+        ("optim.learning_rate", "did you mean optim.lr?"),
+        ("lr", "did you mean optim.lr?"),
+        ("train.lr", "did you mean optim.lr?"),
+        ("optim.stepps", "did you mean optim.steps?"),
+        ("optim.batch_size", "did you mean optim.batch?"),
+        ("optim.warmup_steps", "did you mean optim.warmup?"),
+        ("opt.weight_decay", "did you mean optim.weight_decay?"),
+        ("run.sed", "did you mean run.seed?"),
+        ("dat.seed", "did you mean data.seed?"),
+        ("data.share.pairs", "did you mean data.shares.pairs?"),
+        ("data.rgbd.1.focal", "did you mean data.rgbd.1.focal_px?"),
+        ("netwrk", "did you mean network?"),
+        ("data.rgbd.1.zzz", "there are folder, focal_px, unit_m"),
+        ("loss.zzz", "there are color, alpha, perceptual, preserve, features, features_path"),
+    ],
+)
+def test_an_unknown_key_is_answered_with_the_key_that_was_meant(
+    tmp_path: Path, key: str, meant: str
+) -> None:
+    camera = "{folder: a, focal_px: 1}"
+    text = f"data: {{rgbd: [{camera}, {camera}]}}\n"
+    (tmp_path / "recipe.yaml").write_text(text)
+    with pytest.raises(InputError) as by_override:
+        load_recipe(Recipe, tmp_path / "recipe.yaml", [f"{key}=3"])
+    assert f"{key}: there is no such key: {meant}" in str(by_override.value)
+
+    # The same key in the file is answered in the same words.
+    content = load_recipe(Recipe, tmp_path / "recipe.yaml").model_dump(mode="json")
+    set_nested(content, key.split("."), 3)
+    (tmp_path / "recipe.yaml").write_text(json.dumps(content))
+    with pytest.raises(InputError) as by_file:
+        load_recipe(Recipe, tmp_path / "recipe.yaml")
+    assert str(by_file.value) == str(by_override.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "meant"),
+    [
+        ("loss.features=resnet", "did you mean resnet50?"),
+        ("run.device=gpu", "input should be 'auto', 'cpu' or 'cuda', not 'gpu'"),
+        ("run.device=cuda0", "did you mean cuda?"),
+        ("optim.precision=bfloat16", "did you mean bf16?"),
+        ("network=u-net", "did you mean unet?"),
+        ("network=sharp_decoder", "did you mean sharp-decoder?"),
+    ],
+)
+def test_an_unknown_value_is_answered_with_the_value_that_was_meant(
+    override: str, meant: str
+) -> None:
+    with pytest.raises(InputError, match=re.escape(meant)):
+        load_recipe(Recipe, "paper", [override])
+
+
+def test_an_unknown_recipe_is_answered_with_the_name_that_was_meant() -> None:
+    with pytest.raises(InputError, match=r"revers_view: no such recipe .did you mean reverse_view"):
+        load_recipe(Recipe, "revers_view")
 
 
 def test_differences_ignore_the_length_of_a_run(tmp_path: Path) -> None:

@@ -8,13 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from spackle.core.trajectories import MAX_DISPARITY
 from spackle.residual.architectures import ARCHITECTURES
 from spackle.runtime.device import Precision
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
+from spackle.runtime.suggestions import closest_name
+from spackle.runtime.validation import validated
 from spackle.weights import installed_weights
 
 PACKAGED_RECIPES = Path(__file__).parent / "recipes"
@@ -184,20 +186,22 @@ class AnyRecipe(RecipePart):
     run: Section[RunRecipe] = RunRecipe()
 
 
+def check_network_name(name: str) -> str:
+    """The name itself; ValueError if it neither is built in nor has the form of a class's name."""
+    if name in ARCHITECTURES or ":" in name:
+        return name
+    suggestion = closest_name(name, ARCHITECTURES)
+    question = "" if suggestion is None else f" (did you mean {suggestion}?)"
+    raise ValueError(f"must be {', '.join(ARCHITECTURES)} or package.module:Class{question}")
+
+
 class Recipe(AnyRecipe):
     """The recipe of a training run of the residual or of direct-ft."""
 
     data: Section[DataRecipe] = DataRecipe()
     loss: Section[LossRecipe] = LossRecipe()
     # Architecture of the residual: a built-in name, or a class of another package.
-    network: Annotated[
-        str,
-        must_hold(
-            f"must be {', '.join(ARCHITECTURES)} or package.module:Class",
-            lambda name: name in ARCHITECTURES or ":" in name,
-        ),
-        MAY_CHANGE_ON_RESUME,
-    ] = "unet"
+    network: Annotated[str, AfterValidator(check_network_name), MAY_CHANGE_ON_RESUME] = "unet"
     init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
 
 
@@ -262,8 +266,7 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
         with as_input_error(override, f"{path} has no such key ({{reason}})"):
             set_nested(content, key.split("."), parse_yaml(value, override))
 
-    with as_input_error(path, "{reason}", ValidationError):
-        return kind.model_validate(content)
+    return validated(kind, content, path)
 
 
 def find_recipe(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
@@ -277,8 +280,11 @@ def find_recipe(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
     if name in packaged_names and not os.path.isfile(path):
         return PACKAGED_RECIPES / f"{name}.yaml"
     if os.sep not in name and not os.path.exists(path):
+        suggestion = closest_name(name, packaged_names)
+        question = "" if suggestion is None else f" (did you mean {suggestion}?)"
         raise InputError(
-            f"{path}: no such recipe; choose from {', '.join(packaged_names)}, or give a YAML file"
+            f"{path}: no such recipe{question}; choose from {', '.join(packaged_names)}, or give a "
+            "YAML file"
         )
     return path
 
