@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -27,6 +28,7 @@ from spackle.paper.training.direct_ft import (
     TunableSharp,
     draw_view_numbers,
     render_views_of_photo,
+    target_of,
 )
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.render import get_renderer
@@ -113,6 +115,45 @@ def test_untrained_views_equal_the_datasets_views(place: Path) -> None:
     assert batch.rgb.shape == (VIEWS, HEIGHT, WIDTH, 3)
     assert float((batch.rgb - batch.base_rgb).abs().max()) < 1.01 / 510  # 8 bits
     assert torch.equal(batch.alpha < 0.95, batch.hole)
+
+
+def test_the_target_of_the_photos_own_view_is_the_photo(place: Path) -> None:
+    base = TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
+    group = DatasetFiles(place / "data")[0]
+    views = [group.view(index) for index in (0, 2, 4)]
+    # The base with random weights does not show the photo.
+    assert float((views[0].photo - views[0].target).abs().mean()) > 0.005
+    with torch.no_grad():
+        batch = render_views_of_photo(base.network.gaussian_decoder(), base, views, get_renderer())
+    assert torch.equal(batch.target[0], views[0].photo)
+    assert torch.equal(batch.target[1:], torch.stack([view.target for view in views[1:]]))
+    assert bool(batch.supervised[0].all())
+    assert torch.equal(batch.supervised[1:], batch.hole[1:])
+
+    # A photo of odd size is stretched to its view, which has even sides.
+    odd = dataclasses.replace(views[0], photo=views[0].photo[1:, 1:])
+    assert target_of(odd).shape == (HEIGHT, WIDTH, 3)
+    assert float((target_of(odd)[1:, 1:] - odd.photo).abs().mean()) < 0.05
+
+
+def test_without_preservation_the_photo_and_the_holes_alone_teach(place: Path) -> None:
+    recipe = load_recipe(Recipe, place / "recipe.yaml", ["loss.preserve=0", "loss.alpha=0"])
+    task = DirectFt(recipe, CPU, place / "sharp.safetensors")
+    task.base = TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
+    decoder = task.base.network.gaussian_decoder()
+    batch = task.load_batch(0, [0])
+    assert batch[0].index == 0
+    with torch.no_grad():
+        views = task.complete(decoder, batch)
+        loss, terms = task.loss(decoder, batch)
+
+    # Mean absolute differences: from the photo everywhere, from other targets in the hole.
+    differences = [float((views.rgb[0] - batch[0].photo).abs().mean())]
+    for rgb, view in zip(views.rgb[1:], batch[1:], strict=True):
+        differences.append(float((rgb - view.target).abs()[view.mask].mean()))
+    assert float(terms["color"]) == pytest.approx(sum(differences) / len(batch), rel=1e-5)
+    assert float(loss) == pytest.approx(10 * float(terms["color"]), rel=1e-6)
+    assert float(terms["preserve"]) > 0  # is reported, but does not count
 
 
 def test_the_loss_falls_and_only_the_decoder_changes(place: Path, tmp_path: Path) -> None:

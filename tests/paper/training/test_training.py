@@ -275,7 +275,9 @@ def test_gradients_reach_the_whole_network_but_not_the_base(name: str) -> None:
     assert not any(tensor.requires_grad for tensor in tensors_of(sample.crop(2, 3, 24, 24)))
     network = random_network(name=name)
     views = complete_samples(network, network.inputs, [sample], get_renderer())
-    loss, _ = total_loss(**vars(views), recipe=LossRecipe())
+    assert torch.equal(views.supervised, views.hole)
+    images = {name: image for name, image in vars(views).items() if name != "supervised"}
+    loss, _ = total_loss(**images, recipe=LossRecipe())
     loss.backward()
     assert all(tensor.grad is None for tensor in base.tensors)
     assert all(p.grad is not None and bool(p.grad.any()) for p in network.parameters())

@@ -2,8 +2,9 @@
 
 SHARP is a network that turns a photo into Gaussians. Its encoder stays as it is, its decoder is
 trained in place of the residual network. Targets and losses are those of the residual. Each step
-includes the photo's own view, because the paper has losses at the input view only in "the
-non-Spackle training path" ("Training Details and Loss Weights").
+includes the photo's own view, whose target is the photo itself, in every pixel: the paper mentions
+"input-view losses" of "the non-Spackle training path" ("Training Details and Loss Weights"), but
+not what they are.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
 from spackle.bases.settings import MISSING_WEIGHTS_ADVICE
 from spackle.bases.sharp.base import (
@@ -140,8 +142,8 @@ def render_views_of_photo(
         renderer: renders the Gaussians.
 
     Returns:
-        The rendered views, beside those of the dataset, their targets and holes. InputError if
-        memory runs out.
+        The rendered views, beside those of the dataset, their targets and holes. The target of the
+        photo's own view is the photo, which counts in every pixel. InputError if memory runs out.
     """
     photo_camera = views[0].photo_camera
     with report_memory_shortage("try optim.precision=bf16"):
@@ -151,10 +153,34 @@ def render_views_of_photo(
             renderer.render(gaussians, normalised_camera(view.camera, photo_camera))
             for view in views
         ]
-    return ViewBatch.of(
-        (rendering, view.rendering.rgb, view.target, view.mask)
+    images = [
+        (rendering, view.rendering.rgb, target_of(view), view.mask)
         for rendering, view in zip(renderings, views, strict=True)
-    )
+    ]
+    photo_places = [place for place, view in enumerate(views) if is_photos_view(view)]
+    return ViewBatch.of(images, fully_supervised=photo_places)
+
+
+def is_photos_view(view: DatasetView) -> bool:
+    """Whether a view is the photo's own: seen by the photo's camera."""
+    return view.index == 0
+
+
+def target_of(view: DatasetView) -> Tensor:
+    """[H, W, 3] sRGB that a view should show: the photo in its own view, else the completed view.
+
+    For its own view the dataset has the base's rendering, which would teach the decoder nothing
+    but the base's errors.
+    """
+    if not is_photos_view(view):
+        return view.target
+    height, width = view.target.shape[:2]
+    if view.photo.shape[:2] == (height, width):
+        return view.photo
+    # Views have even sides, so a photo with an odd side is stretched by one pixel.
+    photo = view.photo.movedim(-1, 0)[None]  # [1, 3, h, w]
+    stretched = interpolate(photo, (height, width), mode="bilinear", align_corners=False)
+    return stretched[0].movedim(0, -1)
 
 
 class DirectFt(ViewTask):

@@ -57,22 +57,36 @@ class ViewBatch:
     base_rgb: Tensor  # [B, H, W, 3] sRGB of the base alone
     target: Tensor  # [B, H, W, 3] sRGB of what the view should look like
     hole: Tensor  # [B, H, W] bool
+    # [B, H, W] bool: where the loss compares with the target. Elsewhere the view should stay as the
+    # base shows it.
+    supervised: Tensor
 
     @staticmethod
-    def of(images: Iterable[tuple[Rendering, Tensor, Tensor, Tensor]]) -> ViewBatch:
+    def of(
+        images: Iterable[tuple[Rendering, Tensor, Tensor, Tensor]],
+        fully_supervised: Sequence[int] = (),
+    ) -> ViewBatch:
         """Stack images of B views, on the device of the completed views.
 
-        `images` has four things for each view, in this order: the rendering of the completed view,
-        sRGB [H, W, 3] of the base alone, the target [H, W, 3], and the hole [H, W] bool.
+        Args:
+            images: four things for each view, in this order: the rendering of the completed view,
+                sRGB [H, W, 3] of the base alone, the target [H, W, 3], and the hole [H, W] bool.
+            fully_supervised: places of the views in which the target counts in every pixel; in the
+                others it counts in the hole.
         """
         views = list(images)
         device = views[0][0].rgb.device
+        holes = torch.stack([hole.to(device) for _, _, _, hole in views])
+        supervised = holes.clone()
+        for place in fully_supervised:
+            supervised[place] = True
         return ViewBatch(
             rgb=torch.stack([completed.rgb for completed, _, _, _ in views]),
             alpha=torch.stack([completed.alpha for completed, _, _, _ in views]),
             base_rgb=torch.stack([base_rgb.to(device) for _, base_rgb, _, _ in views]),
             target=torch.stack([target.to(device) for _, _, target, _ in views]),
-            hole=torch.stack([hole.to(device) for _, _, _, hole in views]),
+            hole=holes,
+            supervised=supervised,
         )
 
 
@@ -116,7 +130,7 @@ class ViewTask(Task):
             alpha=views.alpha.to(self.device),
             target=views.target.to(self.device),
             base_rgb=views.base_rgb.to(self.device),
-            hole=views.hole.to(self.device),
+            hole=views.supervised.to(self.device),
             recipe=self.recipe.loss,
             features=self.features,
         )
