@@ -41,7 +41,7 @@ def results(
         "terms": f"cite {title}",
         "protocol": "near-view" if near else "large-view",
         "methods": list(figures(0)),
-        "base": {"title": "rgbd", "says": "the dataset's own depth", "weights": None},
+        "base": {"name": "rgbd", "says": "the dataset's own depth", "weights": None},
         "disparities": None if near else [0.3, 0.4, 0.5],
         "second_views": "all" if near else None,
         "side": 1280,

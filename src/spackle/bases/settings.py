@@ -94,6 +94,49 @@ MISSING_WEIGHTS_ADVICE = {
     ),
 }
 _PUBLISHED_NAMES = {"sharp": "sharp", "moge": "depth"}  # of weights, by the base's name
+_TITLES = {"sharp": "SHARP"}  # of bases in tables, where they differ from the base's name
+
+
+def has_other_weights(name: str, digest: object) -> bool:
+    """Whether a base that is named after a published network has other weights than the published.
+
+    Args:
+        name: the base's name.
+        digest: the SHA-256 of its file of weights, as `weights_digests` returns it.
+    """
+    return name in _PUBLISHED_NAMES and digest != PUBLISHED_WEIGHTS[_PUBLISHED_NAMES[name]].sha256
+
+
+def title_of_base(name: str, digest: object) -> str:
+    """A base's name in tables and figures, such as "SHARP", "SHARP stand-in" or "lite".
+
+    A published network's plain name is for its published weights alone: numbers of a small or
+    retrained network below the name SHARP would be taken for SHARP's.
+
+    Args:
+        name: the base's name.
+        digest: the SHA-256 of its file of weights, as `weights_digests` returns it.
+    """
+    title = _TITLES.get(name, name)
+    return f"{title} stand-in" if has_other_weights(name, digest) else title
+
+
+def describe_base(name: str, digest: object, description: str) -> str:
+    """Half a sentence about a base; of a stand-in it says what the base is not.
+
+    Args:
+        name: the base's name.
+        digest: the SHA-256 of its file of weights, as `weights_digests` returns it.
+        description: the sentence for a base with the published weights, or without such weights.
+    """
+    if not has_other_weights(name, digest):
+        return description
+    title = _TITLES.get(name, name)
+    # A few digits tell files of weights apart.
+    return (
+        f"a network built like {title}, with weights that are not the published ones "
+        f"({str(digest)[:8]}): not {title}"
+    )
 
 
 def _installed_weights(base_name: str) -> Path | None:

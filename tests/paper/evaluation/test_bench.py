@@ -31,6 +31,7 @@ from spackle.residual.architectures import open_residual
 from spackle.runtime.errors import InputError
 from spackle.scene_fill import FillContext, fill_view
 from spackle.scene_fill.unet import UNet
+from spackle.weights import PUBLISHED_WEIGHTS
 
 EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
 PAPER_LABELS = {table.label for table in PAPER_TABLES}  # the paper's six tables
@@ -53,7 +54,12 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
         "side": 1280,
         "device": "cuda",
     }
-    config["base"] = {"title": "SHARP", "says": "a network", "device": "cpu"}
+    config["base"] = {
+        "name": "sharp",
+        "says": "a network",
+        "device": "cpu",
+        "weights": PUBLISHED_WEIGHTS["sharp"].sha256,
+    }
     config["residual"] = {
         "weights": "shipped",
         "sha256": "0123456789abcdef",

@@ -10,6 +10,7 @@ import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.depth import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, wrap_loaded_base
+from spackle.bases.settings import describe_base
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
 from spackle.paper.evaluation.case import Case, LoadedCase, SecondView, known_depth
 from spackle.paper.evaluation.datasets import DATASETS, read_cases
@@ -227,11 +228,12 @@ def _configuration(
 def _base_configuration(options: EvaluateOptions) -> dict[str, Any]:
     """What config.json records about the base, which turns photos into Gaussians."""
     base = options.base
+    digests = weights_digests(base.model_files)
     return {
         "name": base.public_name,
-        "title": "SHARP" if base.resolved_name == "sharp" else base.public_name,  # in tables
-        "says": base.description,  # in notes below tables
-        "weights": weights_digests(base.model_files),
+        # In notes below tables.
+        "says": describe_base(base.public_name, digests, base.description),
+        "weights": digests,
         "precision": base.precision,
     }
 

@@ -13,6 +13,7 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from spackle.bases.settings import describe_base, title_of_base
 from spackle.paper.evaluation.paper_numbers import PAPER_SETTINGS, PAPER_TABLES
 
 # The setting of views from the viewpoints of second photos.
@@ -103,13 +104,19 @@ class Run:
 
     @property
     def base_title(self) -> str:
-        """The name of the base in tables, such as "SHARP"."""
-        return str(self.config["base"]["title"])
+        """The name of the base in tables, such as "SHARP"; see `title_of_base`.
+
+        It follows from the base's weights whenever results are shown, so that no stored name can
+        promise weights that were not used.
+        """
+        base = self.config["base"]
+        return title_of_base(str(base["name"]), base["weights"])
 
     @property
     def base_description(self) -> str:
         """Half a sentence about the base, for the notes below tables."""
-        return str(self.config["base"]["says"])
+        base = self.config["base"]
+        return describe_base(str(base["name"]), base["weights"], str(base["says"]))
 
     @property
     def is_benchmark(self) -> bool:
