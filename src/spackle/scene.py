@@ -107,7 +107,7 @@ class Scene:
     def load(
         path: str | os.PathLike[str], *, focal_px: float | None = None, fov: float | None = None
     ) -> Scene:
-        """Read a PLY (ours, INRIA's, SHARP's or PlayCanvas's), SPZ, SOG or .splat file.
+        """Read a scene of this or another program: PLY, SPZ, SOG, glTF or .splat.
 
         Args:
             path: the file.
@@ -250,8 +250,8 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html" (viewer and
-                scene in one file); by default the path's suffix.
+            format: "ply", "compressed.ply", "spz", "v4.spz" (SPZ version 4), "splat", "sog",
+                "glb", or "html" (viewer and scene in one file); by default the path's suffix.
 
         Raises:
             InputError: an unknown format, or a scene too large for the format.

@@ -9,6 +9,7 @@ import io
 import json
 import math
 import struct
+import sys
 import zipfile
 from typing import Any
 
@@ -18,6 +19,11 @@ from PIL import Image
 
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 C0 = 0.28209479177387814
 Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -48,7 +54,26 @@ def spz_columns(data: bytes) -> Columns:
     magic, version, count, degree, bits, flags, reserved = struct.unpack("<4sIIBBBB", raw[:16])
     assert (magic, version, degree, flags, reserved) == (b"NGSP", 3, 0, 0, 0)
     assert len(raw) == 16 + 20 * count
-    body = np.frombuffer(raw, np.uint8, offset=16)
+    return spz_body_columns(np.frombuffer(raw, np.uint8, offset=16), count, bits)
+
+
+def spz_4_columns(data: bytes) -> Columns:
+    magic, version, count, degree, bits, flags, frames, start = struct.unpack(
+        "<4sIIBBBBI12x", data[:32]
+    )
+    assert (magic, version, degree, flags, frames, start) == (b"NGSP", 4, 0, 0, 5, 32)
+    sizes = np.frombuffer(data, "<u8", 2 * frames, offset=start).reshape(frames, 2)
+    ends = start + 16 * frames + np.cumsum(sizes[:, 0])
+    assert ends[-1] == len(data)
+    parts = [
+        zstd.decompress(data[end - size : end])
+        for end, size in zip(ends.tolist(), sizes[:, 0].tolist(), strict=True)
+    ]
+    assert [len(part) for part in parts] == sizes[:, 1].tolist()
+    return spz_body_columns(np.frombuffer(b"".join(parts), np.uint8), count, bits)
+
+
+def spz_body_columns(body: np.ndarray, count: int, bits: int) -> Columns:
     places, alphas, colors, scales, turns = np.split(body, count * np.array([9, 10, 13, 16]))
     # of 24 bits each
     means = np.pad(places.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").reshape(-1, 3) >> 8
@@ -165,6 +190,7 @@ def glb_columns(data: bytes) -> Columns:
 FORMATS = {
     "compressed.ply": compressed_ply_columns,
     "spz": spz_columns,
+    "v4.spz": spz_4_columns,
     "splat": splat_columns,
     "sog": sog_columns,
     "glb": glb_columns,

@@ -157,11 +157,11 @@ def test_bad_files_and_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(
         "spackle.web.local_server.announce", lambda *_: pytest.fail("there is a page")
     )
-    (tmp_path / "written.glb").write_bytes(b"anything")  # a format that cannot be read
+    (tmp_path / "foreign.ksplat").write_bytes(b"anything")  # a format that cannot be read
     (tmp_path / "scene.jpg").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
     behind = dataclasses.replace(base := box_before_wall().base(), means=-base.means)
     save_ply(behind, tmp_path / "behind.ply")
-    known = {"written.glb": "scene.ply", "scene.jpg": "Gaussian scene", "no.jpg": "no such photo"}
+    known = {"foreign.ksplat": "convert", "scene.jpg": "Gaussian scene", "no.jpg": "no such photo"}
     known |= {"behind.ply": "front"}
     for name, why in known.items():
         refuses(run("view", tmp_path / name), name, why)

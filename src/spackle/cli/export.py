@@ -18,8 +18,9 @@ def export(
             "-o",
             "--output",
             metavar="FILE",
-            help="Output file; the suffix sets the format: .ply, .compressed.ply, .spz, .splat, "
-            ".sog, .glb, or .html (a page with the scene). The option may be repeated.",
+            help="Output file; the suffix sets the format: .ply, .compressed.ply, .spz, .v4.spz "
+            "(SPZ version 4, for PlayCanvas), .splat, .sog, .glb, or .html (a page with the "
+            "scene). The option may be repeated.",
         ),
     ],
     as_json: JsonOption = False,

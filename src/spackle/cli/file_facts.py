@@ -14,7 +14,7 @@ from spackle.core.photo import load_photo
 from spackle.depth.depth_map import NEAR_AND_FAR_QUANTILES
 from spackle.depth.in_photo.layouts import load_photo_depth
 from spackle.depth.readers import DEPTH_SUFFIXES, load_depth
-from spackle.formats.scene_files import load_scene, scene_suffix
+from spackle.formats.scene_files import is_scene_folder, load_scene, scene_suffix
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Reporter
 
@@ -23,7 +23,8 @@ FactsOfFile = dict[str, object]  # by the name that the terminal shows
 
 def print_facts(path: Path, reporter: Reporter) -> None:
     """Describe a scene, photo, depth map or clip; InputError for other files."""
-    check_file(path, "scene, photo, depth map or clip")
+    if not is_scene_folder(path):
+        check_file(path, "scene, photo, depth map or clip")
     # A file that is none of the others is read as a photo; the reader of photos refuses all else.
     if scene_suffix(path):
         facts = scene_facts(path)
@@ -65,7 +66,10 @@ def scene_facts(path: Path) -> FactsOfFile:
     facts: FactsOfFile = {
         "kind": f"scene ({scene_suffix(path)})",
         "Gaussians": f"{count:,} ({parts})",
+        "format": scene.format,
     }
+    if scene.writer is not None:
+        facts["written by"] = scene.writer
 
     # Quantiles instead of the extremes, because a few stray Gaussians lie far from all others.
     depths = scene.gaussians.means[:, 2].double().numpy()  # [N]
@@ -80,8 +84,8 @@ def scene_facts(path: Path) -> FactsOfFile:
         facts["camera"] = describe_camera(scene.camera)
     if scene.disparity is not None:
         facts["completed"] = f"for --disparity {scene.disparity:g}"
-    if scene.unread_harmonics:
-        facts["harmonics"] = f"{scene.unread_harmonics} of each Gaussian above degree 0, not read"
+    if scene.losses:
+        facts["notes"] = "; ".join(scene.losses)
     facts["next"] = (
         f"spackle view {path}; `spackle render` makes a video, `spackle export` other formats"
     )

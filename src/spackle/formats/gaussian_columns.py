@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.core.color import linear_to_srgb, srgb_to_linear
-from spackle.core.gaussians import Gaussians
+from spackle.core.gaussians import Gaussians, quat_from_matrix, quat_multiply
 
 Floats = NDArray[np.float32]
 
@@ -104,10 +105,51 @@ class GaussianColumns:
         flipped_quats = self.quats * np.array([1, 1, -1, -1], np.float32)
         return dataclasses.replace(self, means=flipped_means, quats=flipped_quats)
 
+    def to_opencv_axes(self, letters: str) -> GaussianColumns:
+        """Return the scene with x right, y down and z forward.
+
+        Args:
+            letters: where the axes point now, such as "RUB" for x right, y up, z back; they may
+                also mirror the scene.
+        """
+        if letters == "RUB":
+            return self.flip_y_and_z()
+        new_axes = axes_to_opencv(letters)
+        # A mirror cannot be a rotation, but with all three axes reversed it is one; and a Gaussian
+        # is the same along reversed axes.
+        is_mirrored = np.linalg.det(new_axes) < 0
+        rotation = torch.from_numpy(-new_axes if is_mirrored else new_axes)
+        turned = quat_multiply(quat_from_matrix(rotation), torch.from_numpy(self.quats))
+        return dataclasses.replace(self, means=self.means @ new_axes.T, quats=turned.numpy())
+
+    @staticmethod
+    def cat(parts: Sequence[GaussianColumns]) -> GaussianColumns:
+        """Join sets of Gaussians in the given order."""
+        names = [field.name for field in dataclasses.fields(GaussianColumns)]
+        columns = ([getattr(part, name) for part in parts] for name in names)
+        return GaussianColumns(*(np.concatenate(arrays) for arrays in columns))
+
     def select(self, rows: NDArray[np.int64] | slice) -> GaussianColumns:
         """Return the Gaussians that an index array [M] or a slice selects."""
         names = [field.name for field in dataclasses.fields(self)]
         return GaussianColumns(*(getattr(self, name)[rows] for name in names))
+
+
+def axes_to_opencv(letters: str) -> NDArray[np.float32]:
+    """Return the matrix [3, 3] that turns coordinates of a file into x right, y down, z forward.
+
+    Args:
+        letters: where the file's axes point, such as "RUB" for x right, y up, z back.
+    """
+    directions = {"R": (1, 0, 0), "D": (0, 1, 0), "F": (0, 0, 1)}
+    opposites = {"L": "R", "U": "D", "B": "F"}
+    matrix = np.zeros((3, 3), np.float32)
+    for column, letter in enumerate(letters):
+        if letter in opposites:
+            matrix[:, column] = -np.array(directions[opposites[letter]])
+        else:
+            matrix[:, column] = directions[letter]
+    return matrix
 
 
 def harmonics_to_srgb(harmonics: Floats) -> Floats:

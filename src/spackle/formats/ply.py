@@ -1,6 +1,7 @@
-"""Write Gaussians in INRIA's PLY layout, and read the layouts of INRIA, SHARP and PlayCanvas.
+"""Write Gaussians in INRIA's PLY layout, and read the layouts of many programs.
 
-`save_ply` writes, `PlyFile` reads. `ply_tables.py` knows the container.
+`save_ply` writes, `PlyFile` reads. `ply_tables.py` knows the container, `ply_layout.py` the
+layouts.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.formats.camera_files import checked_camera
 from spackle.formats.compressed_ply import PACKED_PROPERTIES, decode_compressed_ply
 from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
+from spackle.formats.ply_layout import NoGaussiansError, PlyLayout, plain_name
 from spackle.formats.ply_tables import NewTable, PlyElement, PlyTables, ply_header
 from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError, as_input_error
@@ -37,17 +39,17 @@ MAX_OPACITY = 1 - 2.0**-24
 # a row's bits depend neither on the rows after it nor on the number of threads.
 ROWS_PER_BLOCK = 8192
 
-# The properties of a Gaussian that are read, and where each group stands among them.
-READ_PROPERTIES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-READ_PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+# The rows of a block of Gaussians that are read.
 MEANS = slice(0, 3)
 COLORS = slice(3, 6)
 OPACITIES = slice(6, 7)
 SCALES = slice(7, 10)
 QUATS = slice(10, 14)
+BLOCK_HEIGHT = 14
 
 # The properties that are written: also a normal, which some viewers expect.
-WRITTEN_PROPERTIES = [*READ_PROPERTIES[MEANS], "nx", "ny", "nz", *READ_PROPERTIES[3:]]
+WRITTEN_PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+WRITTEN_PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 StrPath = str | os.PathLike[str]
 
@@ -145,7 +147,7 @@ def _fill_table(table: Floats, columns: GaussianColumns) -> None:
 
 
 def load_ply(path: StrPath) -> Gaussians:
-    """Read Gaussians from a binary PLY file in the layout of INRIA, SHARP or PlayCanvas.
+    """Read Gaussians from a PLY file, in any layout of `PlyFile`.
 
     Raises:
         InputError: the file cannot be read, holds no Gaussians, or some are not finite.
@@ -154,7 +156,12 @@ def load_ply(path: StrPath) -> Gaussians:
 
 
 class PlyFile:
-    """A binary PLY file with Gaussians, and what Spackle or SHARP noted of the scene."""
+    """A PLY file with Gaussians, and what Spackle or SHARP noted of the scene.
+
+    The file may be binary, in either order of bytes, or text. Its layout may be that of INRIA and
+    its many followers, of SHARP, of PlayCanvas's compressed files, of 2D Gaussian splatting (flat
+    discs), or have red, green and blue in place of spherical harmonics.
+    """
 
     def __init__(self, path: StrPath) -> None:
         """Read the header of a file; the Gaussians are read by `gaussians`.
@@ -171,14 +178,6 @@ class PlyFile:
         Raises:
             InputError: a part of the file is invalid.
         """
-        # The properties f_rest_0, f_rest_1, … are coefficients of spherical harmonics above degree
-        # 0. They are not read but counted, so that the user can be told.
-        unread_harmonics = 0
-        for element in self._tables.elements:
-            for name in element.property_names:
-                if name.startswith("f_rest_"):
-                    unread_harmonics += 1
-
         # A wrong camera is reported before the Gaussians, which take long, are read.
         camera = self.camera()
         base_count = self.base_count()
@@ -189,8 +188,34 @@ class PlyFile:
             camera=camera,
             base_count=base_count,
             disparity=disparity,
-            unread_harmonics=unread_harmonics,
+            format=self._format(),
+            writer=self._tables.generator,
+            harmonics_degree=self._harmonics_degree(),
+            notes=self._notes(),
+            byte_count=self._tables.file_bytes,
         )
+
+    def _format(self) -> str:
+        """Return what the file's format is called."""
+        if self._tables.elements_named("chunk"):
+            return "compressed PLY"
+        return "text PLY" if self._tables.is_text else "PLY"
+
+    def _harmonics_degree(self) -> int:
+        """Return the degree of the file's spherical harmonics; those above 0 are not read."""
+        # The properties f_rest_0, f_rest_1, … are coefficients: for each degree up to d there are
+        # (d + 1)² - 1 of each colour. A compressed file has them in a table of their own.
+        count = 0
+        for element in self._tables.elements:
+            names = [plain_name(name) for name in element.property_names]
+            count += sum(name.startswith("f_rest_") for name in names)
+        return math.isqrt(count // 3 + 1) - 1
+
+    def _notes(self) -> tuple[str, ...]:
+        """Return what had to be assumed about the Gaussians."""
+        if self._tables.elements_named("chunk"):
+            return ()
+        return PlyLayout.find(self._vertex_element().fields).notes
 
     def gaussians(self) -> Gaussians:
         """Read the Gaussians, with linear RGB colours.
@@ -208,6 +233,7 @@ class PlyFile:
             return self._compressed_gaussians(chunk_elements[0], vertex)
 
         count = vertex.row_count
+        layout = PlyLayout.find(vertex.fields)
         rows = self._tables.rows(vertex)
         are_linear = self._are_colors_linear()
         means = torch.empty(count, 3)
@@ -225,12 +251,12 @@ class PlyFile:
         ]
 
         # One array serves all blocks; a row holds one property.
-        block = np.zeros((len(READ_PROPERTIES), ROWS_PER_BLOCK), np.float32)
+        block = np.zeros((BLOCK_HEIGHT, ROWS_PER_BLOCK), np.float32)
         broken_count = 0
         for start in range(0, count, ROWS_PER_BLOCK):
             block_rows = rows[start : start + ROWS_PER_BLOCK]
             stop = start + len(block_rows)
-            broken_count += _convert_block(block, block_rows, are_linear)
+            broken_count += _convert_block(block, block_rows, layout, are_linear)
             for tensor, group in groups:
                 tensor[start:stop] = torch.from_numpy(block[group, : len(block_rows)].T)
 
@@ -311,20 +337,20 @@ class PlyFile:
             raise InputError(f"{self.path}: {problem}: not a Gaussian scene")
         vertex = elements[0]
 
-        present = vertex.property_names
-        is_compressed = "packed_position" in present
-        needed = PACKED_PROPERTIES if is_compressed else READ_PROPERTIES
-        missing = [name for name in needed if name not in present]
-        if missing:
-            problem = f"its vertices have no {', '.join(missing)}"
-            raise InputError(f"{self.path}: not a Gaussian scene: {problem}")
+        if self._tables.elements_named("chunk"):
+            present = vertex.property_names
+            missing = [name for name in PACKED_PROPERTIES if name not in present]
+            if missing:
+                problem = f"its vertices have no {', '.join(missing)}"
+                raise InputError(f"{self.path}: not a Gaussian scene: {problem}")
+        else:
+            with as_input_error(self.path, "not a Gaussian scene: {reason}", NoGaussiansError):
+                PlyLayout.find(vertex.fields)
 
         advice = "export it as a plain Gaussian scene"
         if vertex.row_count == 0:
             raise InputError(f"{self.path}: holds no Gaussians: {advice}")
-        # The place of a table in the file is unknown (-1) if it has lists, whose lengths vary from
-        # row to row, or comes after a table with lists.
-        if vertex.start_byte < 0:
+        if not self._tables.has_known_place(vertex):
             raise InputError(f"{self.path}: holds lists in or before its vertices: {advice}")
         return vertex
 
@@ -382,29 +408,34 @@ class PlyFile:
         )
 
 
-def _convert_block(block: Floats, rows: NDArray[Any], are_linear: bool) -> int:
+def _convert_block(block: Floats, rows: NDArray[Any], layout: PlyLayout, are_linear: bool) -> int:
     """Convert rows of a PLY file to means, linear colours, opacities, scales and quaternions.
 
     Args:
-        block: [14, ROWS_PER_BLOCK] takes the result: one of READ_PROPERTIES a row, one Gaussian a
+        block: [14, ROWS_PER_BLOCK] takes the result: one number of a Gaussian a row, one Gaussian a
             column. Only the first len(rows) columns are meaningful. The others are computed, too,
             because the last bits of a result may depend on the size of the array; so a Gaussian
             gets the same bits, however many others are in its block.
         rows: at most ROWS_PER_BLOCK rows of the table, with a field for each property.
+        layout: names the properties.
         are_linear: whether the colours are linear RGB; else they are sRGB.
 
     Returns:
         How many of the Gaussians are not finite.
     """
+    count = len(rows)
+    block[MEANS, :count] = layout.read_means(rows)
+    block[COLORS, :count] = layout.read_harmonics(rows)
+    block[OPACITIES, :count] = layout.read_logits(rows)
+    block[SCALES, :count] = layout.read_log_scales(rows)
+    block[QUATS, :count] = layout.read_quats(rows)
     # Numbers beyond float32 become infinite, and are counted below.
     with np.errstate(over="ignore", invalid="ignore"):
-        for index, name in enumerate(READ_PROPERTIES):
-            block[index, : len(rows)] = rows[name]
         block[SCALES] = np.exp(block[SCALES])
         rgb = torch.from_numpy(harmonics_to_srgb(block[COLORS]))
     block[OPACITIES] = torch.from_numpy(block[OPACITIES]).sigmoid()
 
     # The colours are checked before their conversion, which would make infinite ones finite.
-    is_finite = np.isfinite(block[:, : len(rows)]).all(axis=0)  # [len(rows)]
+    is_finite = np.isfinite(block[:, :count]).all(axis=0)  # [len(rows)]
     block[COLORS] = rgb.clamp_min(0) if are_linear else srgb_to_linear(rgb)
     return int(np.count_nonzero(~is_finite))

@@ -1,4 +1,4 @@
-"""The container of a PLY file: a text header, then binary tables. Knows nothing of Gaussians.
+"""The container of a PLY file: a text header, then tables. Knows nothing of Gaussians.
 
 `PlyTables` reads a file; `ply_header` writes the header of one.
 """
@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import os
 import re
@@ -40,7 +41,10 @@ NUMPY_TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
-NUMPY_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+NUMPY_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+MIN_TEXT_BYTES = 2  # of a number in a text file: a digit, and a space or the line's end
+TEXT_BLOCK_LINES = 1 << 13  # lines of a text file that are parsed at once
 
 # The type, in `PlyElement.fields`, of a property that is a list, and so has no fixed size.
 LIST_TYPE = "list"
@@ -99,8 +103,9 @@ class PlyElement:
     # (name of a property, NumPy's type or LIST_TYPE), in the file's order.
     fields: list[tuple[str, str]] = dataclasses.field(default_factory=list)
     # The offset of the first row in the file, in bytes; -1 from the first table with lists on,
-    # because the size of such a table is known only after reading it.
+    # because the size of such a table is known only after reading it, and in text files.
     start_byte: int = -1
+    start_line: int = -1  # the first row's line after the header of a text file; -1 in binary files
 
     @property
     def property_names(self) -> list[str]:
@@ -114,7 +119,7 @@ class PlyElement:
 
 
 class PlyTables:
-    """The header of a binary PLY file, and its tables up to the first one with lists."""
+    """The header of a PLY file, and its tables; in a binary file up to the first one with lists."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Read the header of a file.
@@ -128,7 +133,10 @@ class PlyTables:
         self.elements: list[PlyElement] = []
         # The first word of each comment, and its other words.
         self.comments: dict[str, list[str]] = {}
-        self._byte_order = ""  # "<" or ">", once the format line has been read
+        self.generator: str | None = None  # the program that wrote the file, if a comment says so
+        self.is_text = False
+        self._byte_order = ""  # NumPy's sign of it, once the format line has been read
+        self._first_byte = 0  # of the tables
 
         with open(path, "rb") as file:
             head = file.read(MAX_HEADER_BYTES)
@@ -147,15 +155,53 @@ class PlyTables:
                 self._parse_line(line.split())
             if not self._byte_order:
                 raise ValueError("there is no format line")
-            self._set_start_bytes(end_line.end())
+            self._first_byte = end_line.end()
+            if self.is_text:
+                self._set_start_lines()
+            else:
+                self._set_start_bytes(self._first_byte)
 
     def elements_named(self, name: str) -> list[PlyElement]:
         """Return the tables with this name; a sound file has at most one."""
         return [element for element in self.elements if element.name == name]
 
+    def has_known_place(self, element: PlyElement) -> bool:
+        """Return whether the rows of a table can be read: they have no lists, nor tables before."""
+        is_placed = element.start_byte >= 0 or element.start_line >= 0
+        return is_placed and not element.has_lists
+
     def rows(self, element: PlyElement) -> NDArray[Any]:
-        """Read the rows of a table, as a structured array [row_count]."""
+        """Read the rows of a table, as a structured array [row_count].
+
+        Raises:
+            InputError: a row of a text file is no row of numbers, or is missing.
+        """
+        if self.is_text:
+            return self._text_rows(element)
         return np.fromfile(self.path, element.fields, element.row_count, offset=element.start_byte)
+
+    def _text_rows(self, element: PlyElement) -> NDArray[Any]:
+        """Read the rows of a table of a text file, as a structured array [row_count]."""
+        table = np.empty(element.row_count, element.fields)
+        problem = f"a row of {element.name!r} cannot be read: {{reason}}: export the file again"
+        with open(self.path, "rb") as file, as_input_error(self.path, problem, ValueError):
+            file.seek(self._first_byte)
+            filled_lines = (line for line in file if line.strip())
+            last_line = element.start_line + element.row_count
+            lines = itertools.islice(filled_lines, element.start_line, last_line)
+            for start in range(0, element.row_count, TEXT_BLOCK_LINES):
+                stop = min(start + TEXT_BLOCK_LINES, element.row_count)
+                block_lines = list(itertools.islice(lines, stop - start))
+                if len(block_lines) < stop - start:
+                    raise ValueError("the file is cut off")
+                numbers = np.loadtxt(block_lines, np.float64, comments=None, ndmin=2)
+                if numbers.shape != (stop - start, len(element.fields)):
+                    raise ValueError(f"{numbers.shape[1]} numbers for {len(element.fields)}")
+                # Numbers beyond their type become infinite, or any whole number.
+                with np.errstate(over="ignore", invalid="ignore"):
+                    for column, name in enumerate(element.property_names):
+                        table[name][start:stop] = numbers[:, column]
+        return table
 
     def small_columns(self, max_rows: int) -> dict[str, NDArray[np.float64]]:
         """Read all tables of at most `max_rows` rows, except that of the vertices.
@@ -167,8 +213,8 @@ class PlyTables:
         """
         columns = {}
         for element in self.elements:
-            has_known_place = element.start_byte >= 0 and element.fields
-            if element.name == "vertex" or not has_known_place or element.row_count > max_rows:
+            is_readable = self.has_known_place(element) and bool(element.fields)
+            if element.name == "vertex" or not is_readable or element.row_count > max_rows:
                 continue
             for name in element.property_names:
                 columns[name] = self.rows(element)[name].astype(np.float64)
@@ -220,12 +266,14 @@ class PlyTables:
         match words:
             case ["comment", name, *others]:
                 self.comments[name] = others
+                # As in "Generated by Nerfstudio 1.1.5".
+                if name.lower() == "generated" and others[:1] == ["by"]:
+                    self.generator = " ".join(others[1:])
             case [] | ["comment" | "obj_info", *_]:
                 pass
-            case ["format", "ascii", _]:
-                raise ValueError("the file is text: export a binary PLY")
             case ["format", format_name, _]:
                 self._byte_order = NUMPY_BYTE_ORDERS[format_name]
+                self.is_text = format_name == "ascii"
             case ["element", name, row_count] if int(row_count) >= 0:
                 self.elements.append(PlyElement(name, int(row_count)))
             case ["property", "list", _, _, name]:
@@ -235,6 +283,26 @@ class PlyTables:
                 self.elements[-1].fields.append((name, numpy_type))
             case _:
                 raise ValueError(f"cannot understand the line {' '.join(words)[:80]!r}")
+
+    def _set_start_lines(self) -> None:
+        """Set in which line of a text file each table starts; each row is a line.
+
+        Raises:
+            InputError: the file is too short.
+            ValueError: two properties of a table have the same name.
+        """
+        start_line = 0
+        for element in self.elements:
+            element.start_line = start_line
+            start_line += element.row_count
+            if not element.has_lists:
+                np.dtype(element.fields)  # raises for two equal names
+            # A list has at least the number of its items.
+            min_bytes = element.row_count * MIN_TEXT_BYTES * len(element.fields)
+            if min_bytes > self.file_bytes + 1:  # the last line may have no end
+                announced = f"{element.row_count} rows of {element.name!r} are announced"
+                ending = f"but the file ends after {self.file_bytes} bytes"
+                raise InputError(f"{self.path}: cut off: {announced}, {ending}")
 
     def _set_start_bytes(self, first_byte: int) -> None:
         """Set where each table starts, up to the first one with lists.

@@ -1,4 +1,7 @@
-"""What a scene file holds: Gaussians, and what Spackle needs to go on with a scene."""
+"""What a scene file holds: Gaussians, and what Spackle needs to go on with a scene.
+
+A reader of a format returns a `DecodedScene`; `load_scene` makes it a `SceneFile`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,26 @@ import torch
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.formats.gaussian_columns import GaussianColumns
+
+
+class UnsupportedSceneError(ValueError):
+    """A file that may be sound, but is not read; the text says what it is, and what to do."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DecodedScene:
+    """What a reader finds in a file; all but the Gaussians may be unknown."""
+
+    columns: GaussianColumns
+    format: str  # with the version, such as "SPZ 3"
+    writer: str | None = None  # the program that wrote the file, as the file names it
+    # The highest degree of the file's spherical harmonics. Those above degree 0 are not read.
+    harmonics_degree: int = 0
+    # What else was left out or assumed, each in a few words for the user.
+    notes: tuple[str, ...] = ()
+    camera: Camera | None = None  # of the photo
+    base_count: int | None = None  # how many Gaussians come from the photo
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +47,24 @@ class SceneFile:
     # How far to the side the camera may go, because the holes that it uncovers are filled. A
     # disparity of 1 shifts the nearest surface by the picture's diagonal.
     disparity: float | None = None
-    # The coefficients of spherical harmonics above degree 0 that each Gaussian of the file has.
-    # They are not read.
-    unread_harmonics: int = 0
+    format: str = ""  # with the version, such as "SPZ 3"
+    writer: str | None = None  # the program that wrote the file, as the file names it
+    # The highest degree of the file's spherical harmonics. Those above degree 0 are not read.
+    harmonics_degree: int = 0
+    # What else was left out or assumed, each in a few words for the user.
+    notes: tuple[str, ...] = ()
+    byte_count: int = 0  # of the file, or of all files of the scene
+
+    @property
+    def losses(self) -> list[str]:
+        """What was left out or assumed when the file was read, each in a few words."""
+        losses = list(self.notes)
+        if self.harmonics_degree > 0:
+            losses.append(
+                f"spherical harmonics of degree {self.harmonics_degree} are dropped: "
+                "colours do not change with the view"
+            )
+        return losses
 
     @property
     def camera_at_origin(self) -> Camera | None:

@@ -1,6 +1,7 @@
-"""SOG 2, PlayCanvas's format: Gaussians as lossless WebP images, zipped into one file.
+"""SOG, PlayCanvas's format: Gaussians as lossless WebP images, in a folder or zipped into one file.
 
-A pixel is a Gaussian. Scales and colours are indices into codebooks of 256 values.
+A pixel is a Gaussian. In version 2, scales and colours are indices into codebooks of 256 values; in
+version 1, fractions between two bounds. `encode_sog` writes version 2; `sog_reader.py` reads both.
 """
 
 from __future__ import annotations
@@ -16,19 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
+from spackle.formats.gaussian_columns import Floats, GaussianColumns
 from spackle.formats.quantization import (
-    codes_to_fractions,
     components_to_fractions,
-    decode_smallest_three,
     encode_smallest_three,
-    fractions_to_components,
 )
 from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError
 
 MAX_IMAGE_SIDE_PX = 16_380  # pixels; the largest multiple of four that a WebP image can have
-MAX_MEMBER_BYTES = 1 << 28  # of a file in an archive that is read
 
 CODEBOOK_SIZE = 256
 # Values are counted in this many bins to find a codebook for them.
@@ -46,6 +43,8 @@ FIRST_LARGEST_COMPONENT_CODE = 252
 
 # `exact` keeps the colours of pixels whose alpha is 0. A slower method saves little.
 WEBP_OPTIONS: dict[str, Any] = {"lossless": True, "exact": True, "quality": 25, "method": 1}
+
+META_NAME = "meta.json"  # the file that describes the images
 
 # A constant time for files in the archive, so that the same scene gives the same bytes.
 ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)
@@ -101,7 +100,7 @@ def encode_sog(scene: SceneFile) -> bytes:
         "quats.webp": _encode_rotations(columns.quats),
         "sh0.webp": np.concatenate([color_codes, opacities], axis=1),
     }
-    members = {"meta.json": json.dumps(meta, allow_nan=False).encode()}
+    members = {META_NAME: json.dumps(meta, allow_nan=False).encode()}
     for name, rgba in pixels.items():
         members[name] = _encode_webp(rgba, width)
     return _zip_members(members)
@@ -197,104 +196,3 @@ def _zip_members(members: Mapping[str, bytes]) -> bytes:
         for name, content in members.items():
             archive.writestr(zipfile.ZipInfo(name, ARCHIVE_TIME), content)
     return buffer.getvalue()
-
-
-def decode_sog(data: bytes) -> GaussianColumns:
-    """Decode a bundled SOG file of version 2.
-
-    Raises:
-        Exception: any exception, if the file is damaged or of another version.
-    """
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        meta = json.loads(_read_member(archive, "meta.json"))
-        if meta["version"] != 2:
-            raise ValueError(f"version {meta['version']}, not 2")
-        count = int(meta["count"])
-        # Pixels [N, 4] of each image.
-        means_images = _read_images(archive, meta["means"]["files"], count)
-        scales_images = _read_images(archive, meta["scales"]["files"], count)
-        quats_images = _read_images(archive, meta["quats"]["files"], count)
-        colors_images = _read_images(archive, meta["sh0"]["files"], count)
-    # A position is in two images, which hold its lower and its upper bytes.
-    low_bytes, high_bytes = means_images
-    (scale_codes,) = scales_images
-    (rotation_codes,) = quats_images
-    (color_codes,) = colors_images
-
-    position_codes = high_bytes[:, :3] * np.uint32(256) + low_bytes[:, :3]
-    means = _dequantize_positions(position_codes, meta["means"]["mins"], meta["means"]["maxs"])
-    log_scales = _look_up_codes(scale_codes[:, :3], meta["scales"]["codebook"])
-    harmonics = _look_up_codes(color_codes[:, :3], meta["sh0"]["codebook"])
-    return GaussianColumns(
-        means=means,
-        quats=_decode_rotations(rotation_codes),
-        log_scales=log_scales,
-        opacities=codes_to_fractions(color_codes[:, 3], 255),
-        srgb=np.clip(harmonics_to_srgb(harmonics), 0, 1),
-    )
-
-
-def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Read a file of an archive; ValueError if it is too large, before it is decompressed."""
-    if archive.getinfo(name).file_size > MAX_MEMBER_BYTES:
-        raise ValueError(f"{name} is too large")
-    return archive.read(name)
-
-
-def _read_images(archive: zipfile.ZipFile, names: list[str], count: int) -> list[NDArray[np.uint8]]:
-    """Read images as pixels [count, 4], without the padding at their ends.
-
-    Raises:
-        ValueError: an image is too large, or has fewer than `count` pixels.
-    """
-    images = []
-    for name in names:
-        content = io.BytesIO(_read_member(archive, name))
-        # Only WebP, so that a stranger's file cannot reach the decoders of rare formats.
-        with Image.open(content, formats=["WEBP"]) as image:
-            pixel_count = image.width * image.height
-            if max(image.size) > MAX_IMAGE_SIDE_PX or not 0 < count <= pixel_count:
-                size = f"{image.width}×{image.height}"
-                raise ValueError(f"{name} has {size} pixels for {count:,} Gaussians")
-            rgba = np.asarray(image.convert("RGBA"))
-        images.append(rgba.reshape(-1, 4)[:count])
-    return images
-
-
-def _dequantize_positions(codes: NDArray[np.uint32], low: object, high: object) -> Floats:
-    """Return positions [N, 3] from codes; the inverse of `_quantize_positions`.
-
-    Args:
-        codes: [N, 3] in 0..65535.
-        low, high: lists of the three logarithms to which the codes 0 and 65535 belong.
-    """
-    low_logs = np.array(low, np.float32).reshape(3)
-    high_logs = np.array(high, np.float32).reshape(3)
-    fractions = codes_to_fractions(codes, MAX_POSITION_CODE)
-    log_positions = low_logs + (high_logs - low_logs) * fractions
-    # Broken bounds may give infinite positions, which `GaussianColumns.to_gaussians` refuses.
-    with np.errstate(over="ignore"):
-        positions: Floats = np.copysign(np.expm1(np.abs(log_positions)), log_positions)
-    return positions
-
-
-def _look_up_codes(codes: NDArray[np.uint8], book: object) -> Floats:
-    """Return the values [N, 3] of codes [N, 3] in a codebook, a list of 256 numbers."""
-    values: Floats = np.array(book, np.float32).reshape(CODEBOOK_SIZE)
-    return values[codes]
-
-
-def _decode_rotations(rgba: NDArray[np.uint8]) -> Floats:
-    """Return unit quaternions [N, 4] (w, x, y, z) from pixels [N, 4].
-
-    Red, green and blue hold the three smaller components, with 0 for -√½ and 255 for √½. Alpha is
-    252 plus the index of the largest component.
-
-    Raises:
-        ValueError: an alpha does not name a component.
-    """
-    largest = rgba[:, 3].astype(np.int64) - FIRST_LARGEST_COMPONENT_CODE
-    if largest.min() < 0:
-        raise ValueError("a rotation has no largest component")
-    others = fractions_to_components(codes_to_fractions(rgba[:, :3], 255))
-    return decode_smallest_three(largest, others)

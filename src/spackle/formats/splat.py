@@ -6,7 +6,7 @@ import numpy as np
 
 from spackle.formats.gaussian_columns import MAX_SCALE, MIN_SCALE, GaussianColumns
 from spackle.formats.quantization import codes_to_fractions
-from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_content import DecodedScene, SceneFile
 
 # One Gaussian in the file. A quaternion's component c in -1..1 is stored as 128 + 128 c.
 SPLAT_ROW = np.dtype(
@@ -34,7 +34,7 @@ def encode_splat(scene: SceneFile) -> bytes:
     return rows.tobytes()
 
 
-def decode_splat(data: bytes) -> GaussianColumns:
+def decode_splat(data: bytes) -> DecodedScene:
     """Decode a .splat file.
 
     Raises:
@@ -46,10 +46,11 @@ def decode_splat(data: bytes) -> GaussianColumns:
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(np.clip(rows["scales"], MIN_SCALE, MAX_SCALE))
     # A byte b of a rotation stands for the component (b - 128) / 128.
-    return GaussianColumns(
+    columns = GaussianColumns(
         means=rows["means"],
         quats=codes_to_fractions(rows["quats"], 128) - 1,
         log_scales=log_scales,
         opacities=rgba[:, 3],
         srgb=rgba[:, :3],
     )
+    return DecodedScene(columns=columns, format="splat")

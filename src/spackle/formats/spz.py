@@ -1,14 +1,12 @@
-"""SPZ, Niantic's compressed format: 20 bytes for each Gaussian, deflated as gzip does.
+"""SPZ, Niantic's compressed format: 20 bytes for each Gaussian, then compressed.
 
-`encode_spz` writes version 3; `decode_spz` reads the versions 2 and 3.
+`encode_spz` writes version 3, `encode_spz_4` version 4; `decode_spz` reads the versions 1 to 4.
 """
 
 from __future__ import annotations
 
 import bisect
 import dataclasses
-import struct
-import zlib
 from typing import NamedTuple
 
 import numpy as np
@@ -21,18 +19,18 @@ from spackle.formats.quantization import (
     decode_smallest_three,
     encode_smallest_three,
 )
-from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_content import DecodedScene, SceneFile, UnsupportedSceneError
+from spackle.formats.spz_container import (
+    MAGIC,
+    MAX_COUNT,
+    SpzHeader,
+    deflate,
+    pack_parts,
+    unpack_parts,
+)
 from spackle.runtime.errors import InputError
 
-MAGIC = 0x5053474E  # "NGSP", lowest byte first
-WRITTEN_VERSION = 3
-
-# Magic, version, number of Gaussians, degree of the spherical harmonics, fractional bits of a
-# coordinate, flags, a reserved byte.
-HEADER = struct.Struct("<IIIBBBB")
-
-MAX_COUNT = 10_000_000  # most Gaussians that the format's own library reads
-MAX_HARMONICS_DEGREE = 3
+WRITTEN_VERSION = 3  # most programs read it; PlayCanvas only reads version 4
 
 # A coordinate is a fixed-point number of 24 bits with a sign, of which some are fractional.
 MAX_GRID_COORDINATE = 2**23 - 1
@@ -59,10 +57,10 @@ SCALE_STEPS = 16
 MAX_COMPONENT_CODE = 511
 COMPONENT_SIGN_BIT = 512
 
-# Arguments of zlib: the container of gzip, the largest window, the most memory.
-GZIP_WINDOW_BITS = 16 + 15
-DEFLATE_MEMORY = 9
-DEFLATE_LEVEL = 5  # level 6 takes twice the time for files 1 % smaller
+# Where the axes of a file point, by their number in an extension. The usual ones are RUB: x right,
+# y up, z back.
+AXES = ["RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"]
+AXES += ["LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
 
 # A file may take an eighth of the PLY's 68 bytes for each Gaussian. Rounded values deflate
 # better, so values are rounded more and more coarsely until the file is small enough.
@@ -105,7 +103,20 @@ class SpzGrid(NamedTuple):
 
 
 def encode_spz(scene: SceneFile) -> bytes:
-    """Encode a scene as an SPZ file of version 3, in the scene's order.
+    """Encode a scene as an SPZ file of version 3, which most programs read; see `_encode`."""
+    return _encode(scene, WRITTEN_VERSION)
+
+
+def encode_spz_4(scene: SceneFile) -> bytes:
+    """Encode a scene as an SPZ file of version 4, compressed with Zstandard; see `_encode`.
+
+    The Gaussians are those of version 3, bit for bit.
+    """
+    return _encode(scene, 4)
+
+
+def _encode(scene: SceneFile, version: int) -> bytes:
+    """Encode a scene as an SPZ file of a version, in the scene's order.
 
     The axes become y up and z backward, as the format requires. Positions are rounded to the
     grid of `spz_grid`. A Gaussian outside of the grid is moved towards the origin and shrunk
@@ -123,16 +134,15 @@ def encode_spz(scene: SceneFile) -> bytes:
     columns = GaussianColumns.from_gaussians(scene.gaussians).flip_y_and_z()
     fraction_bits = spz_grid(scene.gaussians).fraction_bits
     columns = _shrink_into_grid(columns, fraction_bits)
-    header_fields = SpzHeader(
+    header = SpzHeader(
         magic=MAGIC,
-        version=WRITTEN_VERSION,
+        version=version,
         gaussian_count=count,
         harmonics_degree=0,
         fraction_bits=fraction_bits,
         flags=0,
-        reserved=0,
+        frame_count=0,
     )
-    header = HEADER.pack(*header_fields)
 
     # ROUNDINGS go from fine to coarse. The first one with which samples of the Gaussians get small
     # enough may be too fine for the whole file; then coarser ones follow.
@@ -140,7 +150,7 @@ def encode_spz(scene: SceneFile) -> bytes:
     max_bytes = max(MAX_BYTES_PER_GAUSSIAN * count, SMALL_FILE_BYTES)
     first_index = _finest_rounding_of_samples(columns, fraction_bits)
     for rounding in ROUNDINGS[first_index:]:
-        data = _deflate(header + b"".join(_encode_sections(columns, fraction_bits, rounding)))
+        data = pack_parts(header, _encode_sections(columns, fraction_bits, rounding))
         if len(data) <= max_bytes:
             break
     return data
@@ -221,7 +231,7 @@ def _finest_rounding_of_samples(columns: GaussianColumns, fraction_bits: int) ->
 
     def is_small_enough(rounding: Rounding) -> bool:
         sections = _encode_sections(sampled_columns, fraction_bits, rounding)
-        return len(_deflate(b"".join(sections))) <= max_bytes
+        return len(deflate(b"".join(sections))) <= max_bytes
 
     # Coarser roundings give smaller files, so bisection finds the first one that is enough. The
     # last one need not be tried, because it is taken if no other is enough.
@@ -320,87 +330,50 @@ def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
     return words
 
 
-def _deflate(data: bytes) -> bytes:
-    """Compress bytes as gzip does, without a time, so that equal data gives equal files."""
-    compressor = zlib.compressobj(DEFLATE_LEVEL, zlib.DEFLATED, GZIP_WINDOW_BITS, DEFLATE_MEMORY)
-    return compressor.compress(data) + compressor.flush()
-
-
-def decode_spz(data: bytes) -> GaussianColumns:
+def decode_spz(data: bytes) -> DecodedScene:
     """Decode an SPZ file, with y down and z forward, and colours of degree 0.
 
     Raises:
-        ValueError: the file has another version, or is too short.
-        zlib.error: the file is damaged.
+        UnsupportedSceneError: the file is of an unknown version.
+        ValueError: the file is too short.
+        Exception: the compressed data are damaged.
     """
-    header, (positions, opacities, colors, scales, rotations) = _inflate_sections(data)
+    parts = unpack_parts(data)
+    version = parts.header.version
     # A byte, as a fraction of 255, is 0.5 + COLOR_SCALE · f_dc, where f_dc is the coefficient of
     # the constant spherical harmonic. The colour is srgb = 0.5 + SH_C0 · f_dc.
     srgb_per_color = np.float32(SH_C0 / COLOR_SCALE)
-    centered_colors = codes_to_fractions(colors, 255) - np.float32(0.5)
+    centered_colors = codes_to_fractions(parts.colors, 255) - np.float32(0.5)
     srgb = centered_colors * srgb_per_color + np.float32(0.5)
-    if header.version == 3:
-        quats = _decode_rotations(rotations)
+
+    if version == 1:
+        means = parts.positions.view("<f2").astype(np.float32)
     else:
-        quats = _decode_rotations_of_version_2(rotations)
+        means = _decode_positions(parts.positions, parts.header.fraction_bits)
+    if version >= 3:
+        quats = _decode_rotations(parts.rotations)
+    else:
+        quats = _decode_rotations_of_version_2(parts.rotations)
     columns = GaussianColumns(
-        means=_decode_positions(positions, header.fraction_bits),
+        means=means,
         quats=quats,
-        log_scales=codes_to_fractions(scales, SCALE_STEPS) + MIN_LOG_SCALE,
-        opacities=codes_to_fractions(opacities[:, 0], 255),
+        log_scales=codes_to_fractions(parts.scales, SCALE_STEPS) + MIN_LOG_SCALE,
+        opacities=codes_to_fractions(parts.opacities[:, 0], 255),
         srgb=np.clip(srgb, 0, 1),
     )
-    # The format has y up and z backward.
-    return columns.flip_y_and_z()
+    return DecodedScene(
+        columns=_in_opencv_axes(columns, parts.axes),
+        format=f"SPZ {version}",
+        harmonics_degree=parts.header.harmonics_degree,
+    )
 
 
-class SpzHeader(NamedTuple):
-    """What the header of a file says, in the order of HEADER."""
-
-    magic: int
-    version: int
-    gaussian_count: int
-    harmonics_degree: int
-    fraction_bits: int
-    flags: int
-    reserved: int
-
-
-def _inflate_sections(data: bytes) -> tuple[SpzHeader, list[NDArray[np.uint8]]]:
-    """Return the header of an SPZ file, and its decompressed sections.
-
-    No more bytes are decompressed than the header announces, because a small damaged or hostile
-    file could otherwise fill the memory.
-
-    Returns:
-        The header; and for N Gaussians the bytes [N, k] of positions (k = 9), opacities (1),
-        colours (3), scales (3), and rotations (4, in version 2: 3).
-
-    Raises:
-        ValueError: the file has another version, or is too short.
-        zlib.error: the file is damaged.
-    """
-    # zlib takes the container's kind, which is gzip's, as a part of this number.
-    inflater = zlib.decompressobj(GZIP_WINDOW_BITS)
-    header = SpzHeader(*HEADER.unpack(inflater.decompress(data, HEADER.size)))
-    count = header.gaussian_count
-    is_known = header.magic == MAGIC and header.version in (2, 3)
-    if not is_known or header.harmonics_degree > MAX_HARMONICS_DEGREE or count > MAX_COUNT:
-        harmonics = f"harmonics of degree {header.harmonics_degree}"
-        raise ValueError(f"version {header.version} with {count:,} Gaussians and {harmonics}")
-
-    # Harmonics of higher degrees come after these sections, and are not inflated.
-    rotation_bytes = 4 if header.version == 3 else 3
-    section_widths = (9, 1, 3, 3, rotation_bytes)
-    body_bytes = count * sum(section_widths)
-    # For zlib, the limit 0 would mean no limit.
-    body = inflater.decompress(inflater.unconsumed_tail, max(1, body_bytes))
-    if len(body) != body_bytes:
-        raise ValueError(f"it ends after {len(body):,} bytes of {count:,} Gaussians")
-
-    section_ends = np.cumsum(section_widths)[:-1] * count
-    sections = np.split(np.frombuffer(body, np.uint8), section_ends)
-    return header, [section.reshape(count, -1) for section in sections]
+def _in_opencv_axes(columns: GaussianColumns, axes: int) -> GaussianColumns:
+    """Return Gaussians with y down and z forward; `axes` is the number of the file's axes."""
+    if axes >= len(AXES):
+        problem = f"axes of the unknown kind {axes}"
+        raise UnsupportedSceneError(f"SPZ with {problem}: save it with y up and z back, or as PLY")
+    return columns.to_opencv_axes(AXES[axes])
 
 
 def _decode_positions(positions: NDArray[np.uint8], fraction_bits: int) -> Floats:

@@ -24,6 +24,7 @@ from spackle.formats import save_png
 from spackle.formats.html import single_html
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import Encoder, encoder_for, load_scene
+from spackle.formats.sog import META_NAME
 from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio
@@ -223,6 +224,7 @@ def _open_scene_video(
     """
     given_views, keyframes = path.load()
     loaded = load_scene(scene_file)
+    log_losses(loaded, reporter)
     scene = Scene.of_file(loaded, path.video.size, focal_px=focal_px, fov=fov)
     gaussian_sets = _sets_to_render(scene, scene_file, compare=path.video.compare)
 
@@ -323,11 +325,7 @@ def export_scene(scene_file: Path, outputs: Sequence[Path], reporter: Reporter) 
                 )
 
         loaded = load_scene(scene_file)
-        if loaded.unread_harmonics:
-            reporter.log(
-                f"{scene_file}: {loaded.unread_harmonics} spherical harmonics of each Gaussian, "
-                "above degree 0, are left out"
-            )
+        log_losses(loaded, reporter)
 
         # Each file is written whole before the next format is encoded, which saves memory.
         for output, encode in zip(outputs, encoders, strict=True):
@@ -340,17 +338,22 @@ def export_scene(scene_file: Path, outputs: Sequence[Path], reporter: Reporter) 
             _report_file(loaded, output, time.perf_counter() - start, reporter)
 
 
+def log_losses(scene: SceneFile, reporter: Reporter) -> None:
+    """Log a line for each thing that was left out or assumed when a scene was read."""
+    for loss in scene.losses:
+        reporter.log(f"{scene.path.name}: {loss}")
+
+
 def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Reporter) -> None:
     """Log a line about a written file; for SPZ another about Gaussians beyond its grid, if any.
 
     `seconds` is the time that encoding and writing took.
     """
     size = os.path.getsize(output)
-    size_ratio = size / os.path.getsize(scene.path)
     count = len(scene.gaussians)
     reporter.log(
         f"{output}: {count:,} Gaussians, {decimal(size)}, "
-        f"{size_ratio:.0%} of the size of {scene.path.name}, {seconds:.1f} s"
+        f"{size / scene.byte_count:.0%} of the size of {scene.path.name}, {seconds:.1f} s"
     )
 
     # SPZ rounds positions to a grid, which does not reach as far as some Gaussians of a sky lie.
@@ -379,10 +382,11 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
 
 
 def page_name(path: Path) -> str:
-    """A scene's name on the page: its file's name, or its folder's for scene.ply and base.ply."""
-    # `spackle predict` calls every scene scene.ply; its folder has the photo's name.
+    """A scene's name on the page: its file's name, or its folder's for names that many have."""
+    # `spackle predict` calls every scene scene.ply; its folder has the photo's name. An unbundled
+    # SOG scene is a folder, too.
     absolute_path = path.absolute()
     folder_name = absolute_path.parent.name
-    if absolute_path.name in ("scene.ply", "base.ply") and folder_name:
+    if absolute_path.name in ("scene.ply", "base.ply", META_NAME) and folder_name:
         return folder_name
     return absolute_path.stem

@@ -20,8 +20,8 @@ from pathlib import Path
 from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.core.photo import check_photo_size, load_photo
-from spackle.formats.scene_files import scene_suffix
-from spackle.results.saved_scene import page_name
+from spackle.formats.scene_files import is_scene_folder, load_scene, scene_suffix
+from spackle.results.saved_scene import log_losses, page_name
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Reporter, catch_stop_signals
@@ -85,7 +85,7 @@ def show_page(
     title = "Spackle"
     if target is not None:
         with reporter.stage("load"):
-            title = _check_target(target, options)
+            title = _check_target(target, options, reporter)
 
     # A depth map belongs to the first photo alone. Photos that the page sends later have none, and
     # so cannot use the base "rgbd", which needs one.
@@ -119,12 +119,13 @@ def show_page(
         announce(title, urls, address, reporter, opens_browser=options.opens_browser)
 
 
-def _check_target(target: Path, options: ViewOptions) -> str:
+def _check_target(target: Path, options: ViewOptions, reporter: Reporter) -> str:
     """Check that a scene or photo can be shown; returns what the page calls it.
 
     InputError if the scene, the photo or its depth cannot be read.
     """
-    check_file(target, "photo or scene")
+    if not is_scene_folder(target):
+        check_file(target, "photo or scene")
     settings = options.base
     settings.check()
     if scene_suffix(target):
@@ -135,8 +136,10 @@ def _check_target(target: Path, options: ViewOptions) -> str:
         with as_input_error(
             target, "cannot be viewed: {reason}: give the lens with `fov`", ValueError
         ):
-            scene = Scene.load(target, focal_px=options.focal_px, fov=options.fov)
+            loaded = load_scene(target)
+            scene = Scene.of_file(loaded, focal_px=options.focal_px, fov=options.fov)
             scene.page(target.name)  # fails if the page cannot show the scene
+        log_losses(loaded, reporter)
         return page_name(target)
 
     # A depth map belongs to the whole photo, so its frame must not be cropped.

@@ -21,7 +21,7 @@ from spackle.core.photo import PHOTO_SUFFIXES, check_photo_size
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import DepthKind
 from spackle.formats.html import html_safe_json, single_html
-from spackle.formats.scene_files import scene_suffix
+from spackle.formats.scene_files import load_scene, scene_suffix
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import get_renderer
 from spackle.results.photo_folder import REPORT_NAME, PhotoOptions, predict_photo
@@ -155,7 +155,9 @@ class SceneWork:
         scene_file = job.results / SCENE_FILE
         note = ""
         if scene_suffix(source):  # a scene, not a photo: nothing is to be completed
-            Scene.load(source, focal_px=options.focal_px, fov=options.fov).save(scene_file)
+            loaded = load_scene(source)
+            Scene.of_file(loaded, focal_px=options.focal_px, fov=options.fov).save(scene_file)
+            note = "; ".join(loaded.losses)
         else:
             note = self._complete_photo(job, options, reporter)
 

@@ -1,0 +1,261 @@
+"""Read SOG scenes of PlayCanvas, bundled or not, of the versions 1 and 2; `sog.py` writes them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
+from spackle.formats.quantization import (
+    codes_to_fractions,
+    decode_smallest_three,
+    fractions_to_components,
+)
+from spackle.formats.scene_content import DecodedScene, UnsupportedSceneError
+from spackle.formats.sog import (
+    CODEBOOK_SIZE,
+    FIRST_LARGEST_COMPONENT_CODE,
+    MAX_IMAGE_SIDE_PX,
+    MAX_POSITION_CODE,
+    META_NAME,
+)
+from spackle.runtime.errors import short_repr
+
+MAX_MEMBER_BYTES = 1 << 28  # of a file that is read
+
+# A description with so many harmonics has this degree.
+DEGREE_OF_HARMONICS = {3: 1, 8: 2, 15: 3}
+
+# Reads a file of a scene by its name.
+ReadMember = Callable[[str], bytes]
+
+
+def read_sog(path: Path) -> DecodedScene:
+    """Read a SOG scene: a zip archive, a folder with meta.json and images, or its meta.json.
+
+    Raises:
+        UnsupportedSceneError: a zip archive of something else, or an unknown version.
+        Exception: any exception, if the scene is damaged.
+    """
+    with _open_members(path) as read_member:
+        meta = json.loads(read_member(META_NAME))
+        _check_meta(meta)
+        # The first version does not name itself, and its number of Gaussians is that of a table.
+        version = meta.get("version", 1)
+        count = int(meta["count"] if version == 2 else meta["means"]["shape"][0])
+        # Pixels [N, 4] of each image. A position is in two images: its lower and upper bytes.
+        low_bytes, high_bytes = _read_images(read_member, meta["means"]["files"], count)
+        (scale_codes,) = _read_images(read_member, meta["scales"]["files"], count)
+        (rotation_codes,) = _read_images(read_member, meta["quats"]["files"], count)
+        (color_codes,) = _read_images(read_member, meta["sh0"]["files"], count)
+
+    position_codes = high_bytes[:, :3] * np.uint32(256) + low_bytes[:, :3]
+    opacities = codes_to_fractions(color_codes[:, 3], 255)
+    if version == 2:
+        log_scales = _look_up_codes(scale_codes[:, :3], meta["scales"]["codebook"])
+        harmonics = _look_up_codes(color_codes[:, :3], meta["sh0"]["codebook"])
+    else:
+        log_scales = _between_bounds(scale_codes[:, :3], meta["scales"])
+        harmonics_and_logit = _between_bounds(color_codes, meta["sh0"])  # [N, 4]
+        harmonics = harmonics_and_logit[:, :3]
+        with np.errstate(over="ignore"):  # a very negative logit is an opacity of 0
+            odds_against = np.exp(-harmonics_and_logit[:, 3])
+        opacities = (1 / (1 + odds_against)).astype(np.float32)
+    columns = GaussianColumns(
+        means=_dequantize_positions(position_codes, meta["means"]["mins"], meta["means"]["maxs"]),
+        quats=_decode_rotations(rotation_codes),
+        log_scales=log_scales,
+        opacities=opacities,
+        srgb=np.clip(harmonics_to_srgb(harmonics), 0, 1),
+    )
+    return DecodedScene(
+        columns=columns,
+        format=f"SOG {version}",
+        writer=_generator(meta),
+        harmonics_degree=_harmonics_degree(meta.get("shN")),
+    )
+
+
+def _check_meta(meta: Any) -> None:
+    """Raise an UnsupportedSceneError unless a description is that of a SOG scene."""
+    if isinstance(meta, dict) and "lodLevels" in meta:
+        advice = "give the folder of one level, or the scene from which it was made"
+        raise UnsupportedSceneError(f"a streamed SOG scene of several levels: {advice}")
+    if not isinstance(meta, dict) or not {"means", "scales", "quats", "sh0"} <= set(meta):
+        advice = "give the meta.json beside the images of a SOG scene"
+        raise UnsupportedSceneError(f"not the description of a SOG scene: {advice}")
+    version = meta.get("version", 1)
+    if version not in (1, 2):
+        problem = f"SOG version {short_repr(version)} (versions 1 and 2 are read)"
+        raise UnsupportedSceneError(f"{problem}: save it as version 2, or as PLY")
+
+
+def _generator(meta: Mapping[str, Any]) -> str | None:
+    """Return the name of the program that wrote a description, if it names itself."""
+    asset = meta.get("asset")
+    generator = asset.get("generator") if isinstance(asset, dict) else None
+    return generator if isinstance(generator, str) else None
+
+
+def _harmonics_degree(harmonics: Any) -> int:
+    """Return the degree of the spherical harmonics of a scene; 0 if there are none.
+
+    Args:
+        harmonics: the part of a description about harmonics above degree 0. Version 2 has the
+            degree as "bands", version 1 the shape of a table with 3 numbers for each harmonic.
+    """
+    if not isinstance(harmonics, dict):
+        return 0
+    if "bands" in harmonics:
+        return int(harmonics["bands"])
+    # The first version always has room for the 15 harmonics of degree 3.
+    shape = harmonics.get("shape", [0, 45])
+    return DEGREE_OF_HARMONICS.get(int(shape[1]) // 3, 3)
+
+
+@contextlib.contextmanager
+def _open_members(path: Path) -> Iterator[ReadMember]:
+    """Yield the function that reads a file of a scene by its name.
+
+    Args:
+        path: a zip archive, a folder, or the description in a folder.
+
+    Raises:
+        UnsupportedSceneError: a zip archive without a description.
+    """
+    if path.is_dir() or not zipfile.is_zipfile(path):
+        folder = path if path.is_dir() else path.parent
+        description = META_NAME if path.is_dir() else path.name
+        yield lambda name: _read_sibling(folder, description if name == META_NAME else name)
+        return
+
+    with zipfile.ZipFile(path) as archive:
+        # Who zips a folder gets names that begin with the folder's name.
+        names = [name for name in archive.namelist() if Path(name).name == META_NAME]
+        if not names:
+            advice = "unpack it, and give the scene inside"
+            raise UnsupportedSceneError(f"a zip archive without the meta.json of a SOG: {advice}")
+        prefix = min(names, key=len).removesuffix(META_NAME)
+        yield lambda name: _read_member(archive, prefix + name)
+
+
+def is_sog_archive(path: Path) -> bool:
+    """Return whether a file is a zip archive with the description of a SOG scene."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(Path(name).name == META_NAME for name in archive.namelist())
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+        return False  # the reader of another format reports the damage
+
+
+def _read_sibling(folder: Path, name: str) -> bytes:
+    """Read a file in a folder.
+
+    Raises:
+        ValueError: the name leads out of the folder, or the file is too large.
+        OSError: there is no such file.
+    """
+    # A description names its images; a hostile one may not reach other files of this machine.
+    if Path(name).name != name:
+        raise ValueError(f"{short_repr(name)} is not a file beside {META_NAME}")
+    path = folder / name
+    if not path.is_file():
+        raise ValueError(f"there is no {short_repr(name)} beside {META_NAME}")
+    if path.stat().st_size > MAX_MEMBER_BYTES:
+        raise ValueError(f"{name} is too large")
+    return path.read_bytes()
+
+
+def sog_byte_count(path: Path) -> int:
+    """Return the bytes of all files of a SOG scene that is a folder, or a description in one."""
+    folder = path if path.is_dir() else path.parent
+    files = [file for file in folder.iterdir() if file.suffix in (".json", ".webp")]
+    return sum(file.stat().st_size for file in files)
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Read a file of an archive; ValueError if it is too large, before it is decompressed."""
+    if archive.getinfo(name).file_size > MAX_MEMBER_BYTES:
+        raise ValueError(f"{name} is too large")
+    return archive.read(name)
+
+
+def _read_images(read_member: ReadMember, names: list[str], count: int) -> list[NDArray[np.uint8]]:
+    """Read images as pixels [count, 4], without the padding at their ends.
+
+    Raises:
+        ValueError: an image is too large, or has fewer than `count` pixels.
+    """
+    images = []
+    for name in names:
+        content = io.BytesIO(read_member(name))
+        # No others, so that a stranger's file cannot reach the decoders of rare formats.
+        with Image.open(content, formats=["WEBP", "PNG"]) as image:
+            pixel_count = image.width * image.height
+            if max(image.size) > MAX_IMAGE_SIDE_PX or not 0 < count <= pixel_count:
+                size = f"{image.width}×{image.height}"
+                raise ValueError(f"{name} has {size} pixels for {count:,} Gaussians")
+            rgba = np.asarray(image.convert("RGBA"))
+        images.append(rgba.reshape(-1, 4)[:count])
+    return images
+
+
+def _between_bounds(codes: NDArray[np.uint8], quantity: Mapping[str, Any]) -> Floats:
+    """Return values [N, k] of codes [N, k], of which 0 and 255 stand for two bounds.
+
+    Args:
+        codes: one row for each Gaussian.
+        quantity: has the k lower bounds as "mins", the k upper bounds as "maxs".
+    """
+    low = np.array(quantity["mins"], np.float32).reshape(codes.shape[1])
+    high = np.array(quantity["maxs"], np.float32).reshape(codes.shape[1])
+    values: Floats = low + (high - low) * codes_to_fractions(codes, 255)
+    return values
+
+
+def _dequantize_positions(codes: NDArray[np.uint32], low: object, high: object) -> Floats:
+    """Return positions [N, 3] from codes; the inverse of `_quantize_positions`.
+
+    Args:
+        codes: [N, 3] in 0..65535.
+        low, high: lists of the three logarithms to which the codes 0 and 65535 belong.
+    """
+    low_logs = np.array(low, np.float32).reshape(3)
+    high_logs = np.array(high, np.float32).reshape(3)
+    fractions = codes_to_fractions(codes, MAX_POSITION_CODE)
+    log_positions = low_logs + (high_logs - low_logs) * fractions
+    # Broken bounds may give infinite positions, which `GaussianColumns.to_gaussians` refuses.
+    with np.errstate(over="ignore"):
+        positions: Floats = np.copysign(np.expm1(np.abs(log_positions)), log_positions)
+    return positions
+
+
+def _look_up_codes(codes: NDArray[np.uint8], book: object) -> Floats:
+    """Return the values [N, 3] of codes [N, 3] in a codebook, a list of 256 numbers."""
+    values: Floats = np.array(book, np.float32).reshape(CODEBOOK_SIZE)
+    return values[codes]
+
+
+def _decode_rotations(rgba: NDArray[np.uint8]) -> Floats:
+    """Return unit quaternions [N, 4] (w, x, y, z) from pixels [N, 4].
+
+    Red, green and blue hold the three smaller components, with 0 for -√½ and 255 for √½. Alpha is
+    252 plus the index of the largest component.
+
+    Raises:
+        ValueError: an alpha does not name a component.
+    """
+    largest = rgba[:, 3].astype(np.int64) - FIRST_LARGEST_COMPONENT_CODE
+    if largest.min() < 0:
+        raise ValueError("a rotation has no largest component")
+    others = fractions_to_components(codes_to_fractions(rgba[:, :3], 255))
+    return decode_smallest_three(largest, others)
