@@ -51,11 +51,19 @@ def train(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Delete a run in OUT and start anew.")
     ] = False,
+    logger: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODULE:FUNCTION",
+            help="A function of yours that gets each logged step and its values by name, for "
+            "instance for Weights & Biases.",
+        ),
+    ] = None,
     verbose: VerboseOption = False,
 ) -> None:
     """Train the residual network or SHARP's decoder.
 
-    Writes best.safetensors, last.safetensors, run.json, pictures and logs.
+    Writes best.safetensors, last.safetensors, run.json, metrics.jsonl, pictures and logs.
     """
     # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
@@ -64,6 +72,7 @@ def train(
     from spackle.paper.training.residual import ResidualTask
     from spackle.paper.training.train import train
     from spackle.runtime.errors import InputError
+    from spackle.runtime.plugins import load_function
 
     # The residual learns from finished training data, in which the base's work is already done.
     if method == "residual" and checkpoint is not None:
@@ -78,6 +87,7 @@ def train(
         output,
         CommandReporter(verbose),
         overwrite,
+        logger=None if logger is None else load_function(logger, "logger"),
     )
     # Ctrl-C or SIGTERM: the run is saved, and the same command resumes it.
     if ended == "stopped":

@@ -3,28 +3,117 @@
 from __future__ import annotations
 
 import importlib
+import os
+import pkgutil
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from types import ModuleType
 from typing import Any
 
-from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.errors import InputError, check_name, reason_in_a_line
+from spackle.runtime.suggestions import closest_name
+
+PLUGIN_FORM = "package.module:Name"
 
 
-def load_plugin(name: str, option: str) -> Any:
+def is_plugin(name: str) -> bool:
+    """Whether a name has the form of a class or function of another package."""
+    return ":" in name
+
+
+def check_name_or_plugin(option: str, name: str, known: Iterable[str]) -> None:
+    """InputError unless a name is known, or has the form `package.module:Name`.
+
+    The message suggests what was probably meant. Only `load_plugin` finds out whether another
+    package has the name.
+
+    Args:
+        option: Python name of the option whose value is `name`.
+        name: the user's value.
+        known: the built-in values.
+    """
+    known_names = list(known)
+    if is_plugin(name) or name in known_names:
+        return
+    # Python writes package.module.Name, so the colon is easily forgotten.
+    module_name, _, attribute = name.rpartition(".")
+    if module_name and attribute.isidentifier():
+        raise InputError(
+            f"`{option}` {name} is unknown: did you mean {module_name}:{attribute}? There are "
+            f"{', '.join(known_names)}, {PLUGIN_FORM}"
+        )
+    check_name(option, name, [*known_names, PLUGIN_FORM])
+
+
+def load_plugin(name: str, option: str, *, needs: Sequence[str] = (), like: str = "") -> Any:
     """Import a class or function of another package, which runs the package's code.
+
+    Modules in the working directory are found, too, if no installed one has the same name.
 
     Args:
         name: the module and the name in it, as `package.module:Name`.
         option: the Python name of the option that was given, for messages.
+        needs: the attributes that the class must have, such as the methods that are called.
+        like: what has these attributes, for the message about a missing one.
 
     Raises:
-        InputError: `name` has another form, or the module cannot be imported, or lacks the name.
+        InputError: `name` has another form, or the module cannot be imported, or lacks the name, or
+            the class lacks an attribute.
     """
     module_name, _, attribute = name.partition(":")
     if not module_name or not attribute.isidentifier():
-        raise InputError(f"`{option}` {name}: give a built-in name, or package.module:Name")
-    # A module can raise any exception while it is imported. The double braces leave "{reason}" in
-    # the text, for which `as_input_error` puts the exception's message.
-    with as_input_error(f"`{option}` {name}", f"cannot import {module_name}: {{reason}}"):
-        module = importlib.import_module(module_name)
+        raise InputError(f"`{option}` {name}: give a built-in name, or {PLUGIN_FORM}")
+    module = _import_module(module_name, f"`{option}` {name}")
     if not hasattr(module, attribute):
-        raise InputError(f"`{option}` {name}: {module_name} has no {attribute}")
-    return getattr(module, attribute)
+        question = _question(attribute, vars(module))
+        raise InputError(f"`{option}` {name}: {module_name} has no {attribute}{question}")
+
+    plugin = getattr(module, attribute)
+    for needed_name in needs:
+        if not hasattr(plugin, needed_name):
+            raise InputError(f"`{option}` {name}: has no {needed_name}: write a class like {like}")
+    return plugin
+
+
+def load_function(name: str, option: str) -> Callable[..., Any]:
+    """Import a function of another package; InputError as from `load_plugin`, or if it is none."""
+    function: Callable[..., Any] = load_plugin(name, option)
+    if not callable(function):
+        raise InputError(f"`{option}` {name}: is no function")
+    return function
+
+
+def _import_module(module_name: str, where: str) -> ModuleType:
+    """Import a module; InputError, which begins with `where`, if that fails for any reason."""
+    # The command `spackle` searches its own folder, where `python` searches the working directory.
+    # At the list's end, because a file there must not take the place of an installed module.
+    working_folder = os.getcwd()
+    if working_folder not in sys.path:
+        sys.path.append(working_folder)
+    importlib.invalidate_caches()  # the user may have written the module just now
+
+    try:
+        return importlib.import_module(module_name)
+    except InputError:  # has a message for the user already
+        raise
+    except Exception as error:  # a module can raise any exception while it is imported
+        question = ""
+        if isinstance(error, ModuleNotFoundError) and error.name == module_name:
+            question = _question(module_name, _modules_beside(module_name))
+        reason = reason_in_a_line(error)
+        raise InputError(f"{where}: cannot import {module_name}: {reason}{question}") from error
+
+
+def _modules_beside(module_name: str) -> list[str]:
+    """The modules of a module's package, or of the working directory if it is in no package."""
+    package_name, dot, _ = module_name.rpartition(".")
+    folders = [os.getcwd()]
+    if package_name:
+        folders = getattr(sys.modules.get(package_name), "__path__", [])
+    return [f"{package_name}{dot}{module.name}" for module in pkgutil.iter_modules(folders)]
+
+
+def _question(name: str, known: Iterable[str]) -> str:
+    """The end of a message, such as ": did you mean my_base?"; "" if no name is similar."""
+    suggestion = closest_name(name, known)
+    return "" if suggestion is None else f": did you mean {suggestion}?"

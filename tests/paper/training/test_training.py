@@ -18,7 +18,16 @@ from helpers.command import Run, names_in, refuses, run
 from helpers.holes import random_network
 from helpers.photos import picture
 from helpers.scenes import box_before_wall, shifted, tensors_of
-from helpers.training_runs import assert_same_weights, losses_of, one_thread, run_two, state
+from helpers.systems import needs_posix_signals
+from helpers.training_runs import (
+    assert_same_weights,
+    killed_at,
+    losses_of,
+    one_thread,
+    run_two,
+    started,
+    state,
+)
 from PIL import Image
 
 from spackle.core.gaussians import Gaussians
@@ -170,6 +179,85 @@ def test_a_run_resumes_after_ctrl_c_with_the_same_result(
     assert train(place, out).code == 0
     assert_same_weights(out, whole)
     assert (out / "best.safetensors").read_bytes() == (whole / "best.safetensors").read_bytes()
+
+
+def metrics_of(folder: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def timeless(lines: list[dict[str, float]]) -> list[dict[str, float]]:
+    return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
+
+
+def test_each_logged_step_is_a_line_of_json(place: Path, whole: Path, tmp_path: Path) -> None:
+    lines = metrics_of(whole)
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    terms = {f"train/{name}" for name in ("loss", "color", "alpha", "preserve", "gradient", "lr")}
+    assert all(line.keys() >= terms | {"seconds"} for line in lines)
+    assert lines[1]["train/lr"] == 1e-3  # the end of the warm-up
+    assert sorted(lines, key=lambda line: line["seconds"]) == lines
+
+    # The last step is also that of the only validation, which run.json has, too.
+    (measures,) = json.loads((whole / "run.json").read_text())["history"]
+    validation = {name for name in lines[5] if name.startswith("validation/")}
+    assert validation == {f"validation/{name}" for name in measures if name != "step"}
+    assert all(lines[5][name] == measures[name.removeprefix("validation/")] for name in validation)
+    assert not any(name.startswith("validation/") for line in lines[:5] for name in line)
+
+    # With a longer interval a line has the means of its steps; a step of validation has a line.
+    out = tmp_path / "out"
+    assert train(place, out, "run.log_every=4", "run.validate_every=3").code == 0
+    third, fourth, last = metrics_of(out)
+    assert (third["step"], fourth["step"], last["step"]) == (3, 4, 6)
+    assert not any(name.startswith("train/") for name in third)
+    for name in terms:
+        assert fourth[name] == pytest.approx(sum(line[name] for line in lines[:4]) / 4)
+        assert last[name] == pytest.approx(sum(line[name] for line in lines[4:]) / 2)
+
+
+@needs_posix_signals
+def test_a_killed_run_resumes_its_lines(place: Path, whole: Path, tmp_path: Path) -> None:
+    # It is killed after five steps; the last checkpoint is that of step 3, between two lines.
+    options = ("run.log_every=2", "run.save_every=3")
+    reference, out = tmp_path / "reference", tmp_path / "out"
+    assert train(place, reference, *options).code == 0
+    killed = started(arguments(place, out, *options), killed_at(5))
+    killed.communicate()
+    assert killed.returncode == -signal.SIGKILL
+    assert [line["step"] for line in metrics_of(out)] == [2, 4]
+    with open(out / "metrics.jsonl", "a") as file:
+        file.write('{"step": 5, "secon')  # a line that was not written to its end
+    assert train(place, out, *options).code == 0
+    assert_same_weights(out, whole)
+    assert timeless(metrics_of(out)) == timeless(metrics_of(reference))
+    assert [line["step"] for line in metrics_of(out)] == [2, 4, 6]
+
+    # A run that begins anew has no lines of the old one.
+    assert train(place, out, "optim.steps=1", "--overwrite").code == 0
+    assert [line["step"] for line in metrics_of(out)] == [1]
+    (out / "metrics.jsonl").write_text("step,loss\n")
+    done = train(place, out, "optim.steps=2")
+    assert (done.code, "metrics.jsonl: not the metrics of a run" in done.lines[-1]) == (2, True)
+
+
+def test_a_function_of_the_user_gets_the_lines(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_log.py").write_text(
+        "lines = []\ndef log(step, values):\n    lines.append((step, dict(values)))\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    done = train(place, tmp_path / "out", "optim.steps=2", "--logger", "my_log:log")
+    assert done.code == 0, done.err
+    lines = sys.modules.pop("my_log").lines
+    assert [{"step": step, **values} for step, values in lines] == timeless(
+        metrics_of(tmp_path / "out")
+    )
+    refuses(train(place, tmp_path / "no", "--logger", "my_log:lgo"), "did you mean log?")
+    refuses(train(place, tmp_path / "no", "--logger", "my_logs:log"), "did you mean my_log?")
+    refuses(train(place, tmp_path / "no", "--logger", "my_log:lines"), "is no function")
+    sys.modules.pop("my_log")
 
 
 def test_a_folder_with_another_recipe_is_refused(place: Path, out: Path) -> None:

@@ -1,14 +1,12 @@
-"""Files of a training run: the checkpoint from which a run resumes, and TensorBoard curves."""
+"""Files of a training run, and the checkpoint from which a run resumes."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import io
 import math
 import shutil
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ import torch
 from torch import Tensor
 
 from spackle.paper.training.recipe import AnyRecipe, changed_keys
+from spackle.paper.training.run_logs import LOGS_FOLDER, METRICS_FILE
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path
 
@@ -23,9 +22,8 @@ CHECKPOINT_FILE = "checkpoint.pt"
 BEST_WEIGHTS = "best.safetensors"  # the averaged weights of the best validation
 LAST_WEIGHTS = "last.safetensors"  # the averaged weights of the last save
 RUN_REPORT = "run.json"
-RUN_FILES = (CHECKPOINT_FILE, BEST_WEIGHTS, LAST_WEIGHTS, RUN_REPORT)
+RUN_FILES = (CHECKPOINT_FILE, BEST_WEIGHTS, LAST_WEIGHTS, RUN_REPORT, METRICS_FILE)
 PICTURES_FOLDER = "pictures"  # one picture a validation
-LOGS_FOLDER = "logs"  # of TensorBoard
 Log = Callable[[str], None]  # prints a line
 
 
@@ -42,6 +40,9 @@ class TrainingProgress:
     seconds: float = 0.0  # in total, over all restarts
     # The measures of each validation by name, and its "step".
     history: list[dict[str, float]] = dataclasses.field(default_factory=list)
+    # The numbers of each step since the last logged one. They are saved, so that the means that are
+    # logged next are those of an uninterrupted run.
+    unlogged: list[dict[str, float]] = dataclasses.field(default_factory=list)
 
     def record_validation(
         self, measures: dict[str, float], selection_measure: str, min_delta: float
@@ -152,24 +153,3 @@ def remove_run(output: Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
-
-
-def open_logs(folder: Path, first_step: int, log: Log) -> AbstractContextManager[Any]:
-    """A context that yields TensorBoard's writer and closes it; it yields None without TensorBoard.
-
-    A resumed run repeats the steps after its checkpoint. Values that the logs already have for
-    these steps, from `first_step` on, are hidden.
-
-    Args:
-        folder: the folder of the run.
-        first_step: the number of the first step that will be logged.
-        log: receives a line if there is no TensorBoard.
-    """
-    try:
-        # If this package is missing, torch's import raises another error than ImportError.
-        import tensorboard  # noqa: F401
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
-        return contextlib.nullcontext()
-    return SummaryWriter(str(folder / LOGS_FOLDER), purge_step=first_step)

@@ -16,6 +16,7 @@ from torch.optim import AdamW
 from spackle.paper.training.checkpoint import RUN_REPORT, Checkpoint, TrainingProgress
 from spackle.paper.training.ranks import rank, rank_count
 from spackle.paper.training.recipe import AnyRecipe
+from spackle.paper.training.run_logs import RunLogs
 from spackle.paper.training.task import Task
 from spackle.runtime.device import hardware_facts, package_versions
 from spackle.runtime.errors import as_input_error
@@ -38,8 +39,7 @@ class TrainingRun:
     optimizer: AdamW
     progress: TrainingProgress = dataclasses.field(default_factory=TrainingProgress)
     is_stopped: bool = False  # whether any process has received Ctrl-C or SIGTERM
-    # TensorBoard's writer; None without TensorBoard, and in processes other than 0.
-    logs: Any = None
+    logs: RunLogs | None = None  # None before the first step, and in processes other than 0
 
     def __post_init__(self) -> None:
         """Let several processes average their gradients, by a wrapper around the network."""
@@ -75,14 +75,9 @@ class TrainingRun:
         `ended` is None while the run goes on.
         """
         if rank() == 0:
-            report = {**self.facts, "ended": ended, **dataclasses.asdict(self.progress)}
-            write_json(report, self.output / RUN_REPORT)
-
-    def log_curves(self, group: str, values: Mapping[str, float]) -> None:
-        """Add a point to TensorBoard's curve of each value; `group` is "train" or "validation"."""
-        if self.logs is not None:
-            for name, value in values.items():
-                self.logs.add_scalar(f"{group}/{name}", value, self.progress.step)
+            progress = dataclasses.asdict(self.progress)
+            del progress["unlogged"]  # says nothing to a reader
+            write_json({**self.facts, "ended": ended, **progress}, self.output / RUN_REPORT)
 
 
 def open_run(

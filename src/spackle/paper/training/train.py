@@ -1,6 +1,7 @@
 """The training loop.
 
-`train` prepares a run, `run_steps` is the loop, `train_step` and `validate_and_save` are its parts.
+`train` prepares a run, `run_steps` is the loop; its parts are `train_step`, `validate_and_report`
+and `save_if_due`.
 
 A `Task` (task.py) defines the network, the data and the loss. Several processes, started by
 torchrun, train one network together (ranks.py): each step is divided between them, and process 0
@@ -30,7 +31,6 @@ from spackle.paper.training.checkpoint import (
     RUN_FILES,
     Checkpoint,
     find_checkpoint,
-    open_logs,
     remove_run,
     save_checkpoint,
 )
@@ -43,6 +43,7 @@ from spackle.paper.training.ranks import (
 )
 from spackle.paper.training.recipe import AnyRecipe
 from spackle.paper.training.run import TrainingRun, open_run
+from spackle.paper.training.run_logs import Logger, open_logs
 from spackle.paper.training.schedule import ema_decay, learning_rate, prefetch, samples_of_step
 from spackle.paper.training.task import Task
 from spackle.runtime.device import pick_device
@@ -65,6 +66,7 @@ def train(
     output: Path,
     reporter: Reporter,
     overwrite: bool = False,
+    logger: Logger | None = None,
 ) -> str:
     """Train a network, or resume a run; under torchrun, as one of several processes.
 
@@ -74,6 +76,8 @@ def train(
         output: a folder for all results.
         reporter: shows progress; used by the first process.
         overwrite: delete an older run in `output`, but keep its samples.
+        logger: called by the first process with the number of a step and its values by name,
+            which are those of the step's line in metrics.jsonl.
 
     Returns:
         Why the run ended: "steps" (all steps are done), "patience" (no improvement) or "stopped"
@@ -112,14 +116,18 @@ def train(
         run = open_run(recipe, task, device, output, reporter, facts)
         if checkpoint is not None:
             run.resume(checkpoint)
-        end_reason = run_steps(run)
+        end_reason = run_steps(run, logger)
         run.write_report(end_reason)
         reporter.log(f"{END_MESSAGES[end_reason]}, step {run.progress.step} -> {output}")
         return end_reason
 
 
-def run_steps(run: TrainingRun) -> str:
-    """The loop: train step by step, log, validate and save, until the run ends.
+def run_steps(run: TrainingRun, logger: Logger | None = None) -> str:
+    """The loop: train step by step, validate, log and save, until the run ends.
+
+    Args:
+        run: the run, at its first step or resumed.
+        logger: a function that gets the values of each logged step.
 
     Returns:
         Why it ended: "steps" (all steps are done), "patience" (no improvement) or "stopped" (by a
@@ -148,7 +156,9 @@ def run_steps(run: TrainingRun) -> str:
 
     with contextlib.ExitStack() as stack:
         if rank() == 0:
-            run.logs = stack.enter_context(open_logs(run.output, progress.step, run.reporter.log))
+            run.logs = stack.enter_context(
+                open_logs(run.output, progress.step, run.reporter.log, logger)
+            )
         batches = stack.enter_context(
             contextlib.closing(prefetch(load_pass, passes, reader_threads))
         )
@@ -157,19 +167,27 @@ def run_steps(run: TrainingRun) -> str:
 
         start_time = time.perf_counter()
         earlier_seconds = progress.seconds  # of the runs that this one resumes
-        # Loss and other numbers of each step since the last log line.
-        recent_steps: list[dict[str, float]] = []
         while run.end_reason() is None:
-            recent_steps.append(train_step(run, batches, stop_requested))
+            # Loss and other numbers of the step wait until they are logged.
+            progress.unlogged.append(train_step(run, batches, stop_requested))
             progress.seconds = earlier_seconds + time.perf_counter() - start_time
 
+            values: dict[str, float] = {}  # what is logged of this step
             is_last_step = progress.step == optim.steps
             if progress.step % settings.log_every == 0 or is_last_step:
-                means = mean_of_steps(recent_steps)
-                run.log_curves("train", means)
+                means = mean_of_steps(progress.unlogged)
+                progress.unlogged.clear()
+                values |= {f"train/{name}": mean for name, mean in means.items()}
                 show_progress(progress.step, f"loss {means['loss']:.4f}")
-                recent_steps = []
-            validate_and_save(run, is_last_step)
+            if progress.step % settings.validate_every == 0 or is_last_step:
+                measures = validate_and_report(run)
+                values |= {f"validation/{name}": mean for name, mean in measures.items()}
+
+            # The checkpoint comes after the logs: a run that is killed between the two repeats the
+            # step, and then cuts its line off.
+            if values and run.logs is not None:
+                run.logs.add(progress.step, progress.seconds, values)
+            save_if_due(run)
 
     end_reason = run.end_reason()
     assert end_reason is not None  # the loop ends for a reason
@@ -288,42 +306,45 @@ def mean_of_steps(steps: list[dict[str, float]]) -> dict[str, float]:
     return {name: sum(numbers[name] for numbers in steps) / len(steps) for name in steps[0]}
 
 
-def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
-    """After a step: validate if it is time, and write the weights and a checkpoint if it is time.
+def validate_and_report(run: TrainingRun) -> dict[str, float]:
+    """Validate the averaged weights; returns the means of the measures by name.
 
-    The recipe's run.validate_every and run.save_every say after how many steps it is time. The last
-    step of the recipe is always validated, and a run that ends is always saved. All processes
-    validate; process 0 writes.
+    All processes validate; process 0 writes the results.
     """
-    settings = run.recipe.run
-    progress = run.progress
-    if progress.step % settings.validate_every == 0 or is_last_step:
-        measures = validate(run.task, run.average, run.device)
-        is_best = progress.record_validation(
-            measures, run.task.selection_measure, settings.min_delta
-        )
-        if rank() == 0:
-            report_validation(run, measures, is_best)
+    measures = validate(run.task, run.average, run.device)
+    is_best = run.progress.record_validation(
+        measures, run.task.selection_measure, run.recipe.run.min_delta
+    )
+    if rank() == 0:
+        report_validation(run, measures, is_best)
+    return measures
 
-    # A validation without improvement may have ended the run, so saving comes after it.
-    is_time_to_save = progress.step % settings.save_every == 0 or run.end_reason() is not None
-    if rank() == 0 and is_time_to_save:
-        run.task.export(run.average, run.output / LAST_WEIGHTS)
-        checkpoint = Checkpoint(
-            progress=progress,
-            network=run.network.state_dict(),
-            average=run.average.state_dict(),
-            optimizer=run.optimizer.state_dict(),
-            recipe=run.facts["recipe"],
-            digest=run.task.digest,
-            method=run.task.name,
-        )
-        save_checkpoint(checkpoint, run.output)
-        run.write_report()
+
+def save_if_due(run: TrainingRun) -> None:
+    """After a step: let process 0 write the weights and a checkpoint, if it is time.
+
+    It is time every `run.save_every` steps of the recipe, and when the run ends, be it that the
+    last validation was no improvement.
+    """
+    is_due = run.progress.step % run.recipe.run.save_every == 0 or run.end_reason() is not None
+    if rank() != 0 or not is_due:
+        return
+    run.task.export(run.average, run.output / LAST_WEIGHTS)
+    checkpoint = Checkpoint(
+        progress=run.progress,
+        network=run.network.state_dict(),
+        average=run.average.state_dict(),
+        optimizer=run.optimizer.state_dict(),
+        recipe=run.facts["recipe"],
+        digest=run.task.digest,
+        method=run.task.name,
+    )
+    save_checkpoint(checkpoint, run.output)
+    run.write_report()
 
 
 def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: bool) -> None:
-    """Write the results of a validation: a picture, curves, a log line and run.json.
+    """Write the results of a validation: a picture, a line of the log and run.json.
 
     If the averaged weights are the best so far, they are exported.
 
@@ -336,9 +357,8 @@ def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: 
     if is_best:
         run.task.export(run.average, run.output / BEST_WEIGHTS)
 
-    run.log_curves("validation", measures)
     if run.logs is not None:
-        run.logs.add_image("views", picture.clamp(0, 1), step, dataformats="HWC")
+        run.logs.add_picture(step, picture)
     values = ", ".join(f"{name} {value:.4f}" for name, value in measures.items())
     run.reporter.log(f"step {step}: validation {values} (best step: {run.progress.best_step})")
     run.write_report()
