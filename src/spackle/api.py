@@ -26,7 +26,7 @@ from spackle.core.trajectories import TrajectoryKind
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.readers import load_depth
 from spackle.depth.units import DepthKind, depth_from_array
-from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
+from spackle.pipeline import FillMode, FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError, short_repr, shorten_input_errors
@@ -50,6 +50,7 @@ class Spackle:
         *,
         residual: Residual = None,
         fill: FillTexture = "auto",
+        mode: FillMode = "scene",
         device: str = "auto",
         renderer: Renderer | None = None,
     ) -> None:
@@ -65,20 +66,26 @@ class Spackle:
                 come with Spackle.
             fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none"
                 keeps the holes.
+            mode: "scene" fills the holes of all views by one set of Gaussians; "view" fills each
+                view by a set of its own; "paper" does so by the paper's method alone (eqs. 2 to
+                9): one pass, no occlusion guard, no texture. Sets of single views are in the
+                scene's `by_view`.
             device: "auto", "cpu" or "cuda", for base and renderer.
             renderer: by default the renderer of the device.
 
         Raises:
-            InputError: an unknown name, or weights that cannot be used.
+            InputError: an unknown name, weights that cannot be used, or a texture together with
+                the mode "paper".
         """
         # A loaded network needs no file, so it is not part of the options.
         if isinstance(residual, ResidualNet):
-            fill_options = FillOptions(fill=fill)
+            fill_options = FillOptions(fill=fill, mode=mode)
             network: ResidualNet | None = residual
         else:
             weights = None if residual is None else os.fspath(residual)
-            fill_options = FillOptions(residual=weights, fill=fill)
+            fill_options = FillOptions(residual=weights, fill=fill, mode=mode)
             network = fill_options.load_network()
+        fill_options.check()
 
         if isinstance(base, str):
             base_settings = BaseSettings(name=base, device=device)
@@ -165,6 +172,7 @@ def predict(
     depth_kind: DepthKind = "auto",
     residual: Residual = None,
     fill: FillTexture = "auto",
+    mode: FillMode = "scene",
     device: str = "auto",
     renderer: Renderer | None = None,
     keep_frame: bool = False,
@@ -192,6 +200,7 @@ def predict(
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
         residual: the network that fills holes, see `Spackle`.
         fill: source of the texture in the holes, see `Spackle`.
+        mode: one set of Gaussians for all views, or one for each view, see `Spackle`.
         device: "auto", "cpu" or "cuda", for base and renderer.
         renderer: by default the renderer of the device.
         keep_frame: keep a uniform frame around a picture. Otherwise the frame is cropped, unless
@@ -206,7 +215,9 @@ def predict(
             with `depth`, or a focal length for a loaded photo.
     """
     # A session for this one photo; what it loads is freed with it.
-    session = Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer)
+    session = Spackle(
+        base, residual=residual, fill=fill, mode=mode, device=device, renderer=renderer
+    )
     return session.predict(
         photo,
         depth,

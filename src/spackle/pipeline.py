@@ -13,9 +13,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -32,7 +32,7 @@ from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
 from spackle.residual.network import ResidualNet
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, check_name
 from spackle.runtime.progress import Progress, Reporter
 from spackle.scene import Scene, SceneReport, ViewHoles
 from spackle.scene_fill.context import FillContext
@@ -43,8 +43,9 @@ from spackle.weights import installed_weights
 
 # Where the texture in the holes comes from; see `open_texture`.
 FillTexture = Literal["auto", "network", "exemplar", "lama", "none"]
-# One set of aux Gaussians for all views, or one set for each view.
-FillMode = Literal["scene", "view"]
+# One set of aux Gaussians for all views; one set for each view; or one set for each view by the
+# paper's method alone, without what Spackle adds to it.
+FillMode = Literal["scene", "view", "paper"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,6 +67,9 @@ class FillOptions:
         # views only; sets of their own would need it for each view, so "auto" does without it.
         if self.mode == "view" and self.fill == "auto":
             return "exemplar"
+        # The paper's method adds no texture; `check` refuses to ask for one.
+        if self.mode == "paper" and self.fill == "auto":
+            return "network"
         return resolve_texture(self.fill)
 
     @property
@@ -84,6 +88,16 @@ class FillOptions:
         if self.weights_name in ("initial", "none"):
             return None
         return SHIPPED if self.weights_name == "shipped" else Path(self.weights_name)
+
+    def check(self) -> None:
+        """InputError if an option has an unknown value, or two options contradict each other."""
+        check_name("fill", self.fill, get_args(FillTexture))
+        check_name("mode", self.mode, get_args(FillMode))
+        if self.mode == "paper" and self.fill in ("exemplar", "lama"):
+            raise InputError(
+                f"`fill` {self.fill}: the paper's method adds no texture: "
+                "leave it out, or give `mode` view"
+            )
 
     def load_network(self) -> ResidualNet | None:
         """Load the network, or None if none is used; InputError for a file that cannot be used."""
@@ -120,9 +134,10 @@ class PredictedPhoto:
 class FilledHoles:
     """The aux Gaussians of all planned views."""
 
-    aux: Gaussians  # for all views; in view mode, those of the view `saved_view`
-    by_view: tuple[Gaussians, ...] | None = None  # in view mode: of each view
-    # In view mode: the name, in the report, of the view whose aux Gaussians are saved.
+    aux: Gaussians  # for all views; in the modes view and paper, those of the view `saved_view`
+    by_view: tuple[Gaussians, ...] | None = None  # in the modes view and paper: of each view
+    # In the modes view and paper: the name, in the report, of the view whose aux Gaussians are
+    # saved.
     saved_view: str | None = None
     # [H, W, 3] uint8 sRGB by the view's index: completed views that the fill has rendered already
     pictures: Mapping[int, Tensor] = dataclasses.field(default_factory=dict)
@@ -159,6 +174,7 @@ class Pipeline:
         """
         options.base.check()
         options.path.check()
+        options.fill.check()
         network = options.fill.load_network()
         # Only to find missing weights of LaMa before long work; `_fill_holes` opens it again.
         open_texture(options.fill.texture)
@@ -309,9 +325,22 @@ class Pipeline:
             texture=open_texture(texture),
             precision=self.options.base.precision,
         )
-        if self.options.fill.mode == "scene":
+        mode = self.options.fill.mode
+        if mode == "scene":
             return self._fill_together(context, views, progress)
-        return _fill_each_view(context, views, progress)
+        if mode == "paper":
+            return _fill_each_view(context, views, context.complete_as_paper, progress)
+
+        # A guard is a view whose surfaces the added Gaussians must not cover: here, the photo.
+        guards = [context.photo_guard()]
+
+        def aux_of_view(camera: Camera) -> Gaussians:
+            """The Gaussians that Spackle adds for one view: two passes, behind what the photo
+            shows, with texture.
+            """
+            return fill_view(context, camera, guards).aux
+
+        return _fill_each_view(context, views, aux_of_view, progress)
 
     def _fill_together(
         self, context: FillContext, views: PlannedViews, progress: Progress
@@ -348,19 +377,23 @@ class Pipeline:
         return FilledHoles(aux=filled.aux, pictures=pictures)
 
 
-def _fill_each_view(context: FillContext, views: PlannedViews, progress: Progress) -> FilledHoles:
-    """Fill the holes of each view by Gaussians of its own, as the paper does.
+def _fill_each_view(
+    context: FillContext,
+    views: PlannedViews,
+    aux_of_view: Callable[[Camera], Gaussians],
+    progress: Progress,
+) -> FilledHoles:
+    """Fill the holes of each view by Gaussians of its own.
 
     Args:
         context: the photo's Gaussians, and the settings of the fill.
         views: the planned views, all of which are filled.
+        aux_of_view: makes the Gaussians that fill the holes of a camera's view.
         progress: called with (views done, all views).
     """
-    # A guard is a view whose surfaces the added Gaussians must not cover: here, the photo.
-    guards = [context.photo_guard()]
     by_view: list[Gaussians] = []
     for camera in views.cameras:
-        by_view.append(fill_view(context, camera, guards).aux)
+        by_view.append(aux_of_view(camera))
         progress(len(by_view), len(views.cameras))
 
     # A file of a scene has room for one set of aux Gaussians. The reported view farthest from the

@@ -93,7 +93,7 @@ class Scene:
     base: Gaussians  # predicted from the photo; never changed
     aux: Gaussians  # added by completion
     camera: Camera  # the photo's camera, at the origin
-    # In view mode, where each view is completed on its own: the aux Gaussians of each view.
+    # In the modes view and paper, which complete each view by itself: each view's aux Gaussians.
     by_view: tuple[Gaussians, ...] | None = None
     disparity: float | None = None  # the camera's movement for which the scene was completed
     report: SceneReport | None = None  # how it was made; None for a scene from a file

@@ -158,10 +158,12 @@ def predict(
     ipd: IpdOption = None,
     convergence: ConvergenceOption = None,
     mode: Annotated[
-        Literal["scene", "view"],
+        Literal["scene", "view", "paper"],
         typer.Option(
             hidden=True,
-            help="scene: one set of aux Gaussians for all views; view: a set for each view.",
+            help="scene: one set of aux Gaussians for all views; view: a set for each view; "
+            "paper: a set for each view by the paper's method alone (eqs. 2 to 9): one pass, no "
+            "occlusion guard, no texture.",
         ),
     ] = "scene",
     device: DeviceOption = "auto",

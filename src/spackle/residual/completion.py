@@ -226,7 +226,7 @@ def complete_view(
     threshold: float = MASK_THRESHOLD,
     least: int = 0,
     rendering: Rendering | None = None,
-    photo: Tensor | None = None,
+    photo: Tensor | Callable[[], Tensor] | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
     """Gaussians that fill the holes of one view, as in the paper (𝒢̃_aug of eq. 7).
@@ -245,13 +245,16 @@ def complete_view(
         least: the least number of cells to fill: if fewer are holes, the `least` least opaque cells
             are filled (the paper trains with 64).
         rendering: the base as the view shows it, if already available.
-        photo: [H, W, 3] sRGB, for a network that names the input "photo"; None: the base rendered
-            from the photo's camera.
+        photo: [H, W, 3] sRGB, for a network that names the input "photo", or a function that
+            returns it, which is called for such a network only; None: the base rendered from the
+            photo's camera.
         precision: of the network; auto is bfloat16 if the hardware multiplies it natively.
     """
 
     def render_photo() -> Tensor:
         """The photo [H, W, 3], sRGB; called only if the network asks for it."""
+        if callable(photo):
+            return photo()
         if photo is not None:
             return photo
         return renderer.render(base, photo_camera).rgb

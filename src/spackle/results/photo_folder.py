@@ -94,7 +94,8 @@ class PhotoReport:
     run: RunReport
     base_notes: Mapping[str, float | int | str]  # what the base measured, filled or assumed
     texture: str  # in the holes: "network", "exemplar", "lama" or "none"
-    mode: str  # "scene": one set of aux Gaussians for all views; "view": one set for each view
+    # "scene": one set of aux Gaussians for all views; "view", "paper": one set for each view
+    mode: str
     disparity: float | None  # size of the camera's movement; None for given views and keyframes
     video: Mapping[str, object] | None  # file, frames and size of the video, if one was written
     holes: tuple[ViewHoles, ...]  # of the reported views: the widest, the keyframes, or the given
@@ -103,7 +104,8 @@ class PhotoReport:
     photo_size: tuple[int, int]  # width and height of the scene's camera, in pixels
     frame_cut_off: Mapping[str, int] | None  # widths of the uniform frame that was cropped
     aux_gaussians: int  # number of Gaussians added in holes
-    saved_view: str | None  # in view mode: the view whose aux Gaussians scene.ply holds
+    # In the modes view and paper: the view whose aux Gaussians scene.ply holds.
+    saved_view: str | None
     files: Mapping[str, Mapping[str, object]]  # size and SHA-256 of each file, by name
 
     @property

@@ -14,7 +14,7 @@ from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual.completion import view_type_of
+from spackle.residual.completion import MIN_AUX_GAUSSIANS, complete_view, view_type_of
 from spackle.residual.features import MASK_THRESHOLD
 from spackle.residual.network import ResidualNet
 from spackle.runtime.device import Precision
@@ -96,6 +96,33 @@ class FillContext:
     def photo_guard(self) -> OcclusionGuard:
         """The surfaces that the photo shows, in front of which no new Gaussian may lie."""
         return OcclusionGuard.of(self.photo_rendering, self.photo_camera, self.threshold)
+
+    def complete_as_paper(
+        self, camera: Camera, base_rendering: Rendering | None = None
+    ) -> Gaussians:
+        """The Gaussians that fill the holes of one view by the paper's method alone (eqs. 2 to 7).
+
+        There is one pass of the network, and one Gaussian for each cell of 2×2 pixels whose first
+        pixel is a hole; if these are fewer than 64, the 64 least opaque cells get one. Texture and
+        guards, which are beyond the paper, have no part in it.
+
+        Args:
+            camera: of the view.
+            base_rendering: the base as this camera sees it, if already available.
+        """
+        context = self.on_renderer_device
+        return complete_view(
+            context.base,
+            camera,
+            context.photo_camera,
+            context.renderer,
+            context.network,
+            threshold=context.threshold,
+            least=MIN_AUX_GAUSSIANS,
+            rendering=base_rendering,
+            photo=lambda: context.photo_rendering.rgb,
+            precision=context.precision,
+        )
 
     def view(self, rendering: Rendering, camera: Camera) -> SceneViewCompletion:
         """The object that completes one view; its parts are computed when they are asked for.

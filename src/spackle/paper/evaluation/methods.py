@@ -15,7 +15,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import MIN_AUX_GAUSSIANS, hole_mask
+from spackle.residual import hole_mask
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.occlusion_guard import OcclusionGuard, move_behind_surfaces
 
@@ -56,7 +56,7 @@ def make_method(
     if name == "base":
         return _on_top_of_base(context, lambda camera, base_rendering: Gaussians.empty())
     if name == "paper":
-        return _on_top_of_base(context, partial(_paper_aux, context))
+        return _on_top_of_base(context, context.complete_as_paper)
     if name == "dense":
         return _on_top_of_base(context, partial(_dense_aux, context, context.photo_guard()))
     if name == "spackle-scene":
@@ -93,21 +93,6 @@ def _on_top_of_base(context: FillContext, added_gaussians: AddedGaussians) -> Fi
         return MethodView(rgb=completed.rgb, alpha=completed.alpha, aux=aux)
 
     return fill
-
-
-@torch.no_grad()
-def _paper_aux(context: FillContext, camera: Camera, base_rendering: Rendering) -> Gaussians:
-    """The Gaussians that the paper's method (eqs. 4 to 7) adds to fill the hole in a view.
-
-    `base_rendering` is the base, rendered by `camera`; it shows where the hole is.
-    """
-    view = context.view(base_rendering, camera)
-    # The network's changes to a first guess of a Gaussian for each cell of 2×2 pixels.
-    deltas = view.deltas(context.network, context.precision)
-    # A cell with a hole gets a Gaussian. If there are too few, the least opaque cells get one.
-    chosen_cells = view.cells(at_least=MIN_AUX_GAUSSIANS)
-    aux = view.gaussians(chosen_cells, deltas)
-    return aux.to(context.base.means.device)
 
 
 def _fill_each_view(
