@@ -65,11 +65,14 @@ def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
     return Gaussians.cat(layers), camera
 
 
-def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
+def holed_scene(side: int = SIDE, height: int | None = None) -> tuple[Gaussians, Camera]:
     """A scene of the same size, with holes only in views from the side: boxes in front of a
     wall.
+
+    `side` is the photo's width in pixels; `height`, by default the same, is its height. As in
+    SHARP, the grid of Gaussians is square whatever the photo's shape is.
     """
-    camera, uv, xs, ys, grid = _pixels(side)
+    camera, uv, xs, ys, grid = _pixels(side, height)
     n, depth = grid * grid, torch.full((grid, grid), WALL_M)
     for left, top, right, bottom, metres in BOXES:
         depth[int(top * grid) : int(bottom * grid), int(left * grid) : int(right * grid)] = metres
@@ -93,14 +96,16 @@ def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
     return Gaussians.cat(layers), camera
 
 
-def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
+def _pixels(side: int, height: int | None = None) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
     """The photo's camera; its cells' centres [g, g, 2], their columns and rows [g, g], and g, the
     cells a side.
     """
+    height = height or side
     grid = side // CELL
     ys, xs = torch.meshgrid(torch.arange(grid), torch.arange(grid), indexing="ij")
-    uv = (torch.stack([xs, ys], dim=-1) + 0.5) * (side / grid)
-    return Camera.from_focal(1.2 * side, side, side), uv, xs, ys, grid
+    pixels_of_cell = torch.tensor([side / grid, height / grid])
+    uv = (torch.stack([xs, ys], dim=-1) + 0.5) * pixels_of_cell
+    return Camera.from_focal(1.2 * side, side, height), uv, xs, ys, grid
 
 
 def find_view(
