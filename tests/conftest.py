@@ -27,6 +27,7 @@ JOURNEYS = (
     "paper/evaluation/test_bench.py",
     "paper/evaluation/test_evaluate.py",
     "paper/evaluation/test_figures.py",
+    "paper/evaluation/test_pairs.py",
     "paper/evaluation/test_report_html.py",
     "paper/training/test_direct_ft.py",
     "paper/training/test_training.py",

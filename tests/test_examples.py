@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import runpy
+import importlib
+import json
 import shutil
 import subprocess
 import sys
@@ -13,14 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.command import decode
-from helpers.evaluation_data import write_boxes
+from helpers.evaluation_data import HEIGHT, WIDTH, write_boxes
 from helpers.photos import write_depth, write_photo
 from helpers.sharp_weights import write_tiny
 from PIL import Image
 
 import spackle
 from spackle.formats import scene_files
-from spackle.paper.evaluation import datasets
 from spackle.paper.training.measured_photos import load_pair
 
 ROOT = Path(__file__).parents[1]
@@ -29,7 +29,9 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 def main_of(number: int) -> Callable[..., Any]:
     (file,) = (ROOT / "examples").glob(f"{number:02}_*.py")
-    main: Callable[..., Any] = runpy.run_path(str(file))["main"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(file.parent)
+        main: Callable[..., Any] = importlib.import_module(file.stem).main
     return main
 
 
@@ -106,13 +108,19 @@ def test_the_example_of_an_own_dataset(tmp_path: Path) -> None:
     shutil.copy(tmp_path / "boxes" / "left.png", folder / "photo.png")
     shutil.copy(tmp_path / "boxes" / "right.png", folder / "second.png")
     np.save(folder / "depth.npy", pair.depth.depth.numpy())
-    (folder / "camera.json").write_text('{"focal_px": 60, "right_m": 0.2}')
-    try:
-        main_of(17)(tmp_path / "pairs", tmp_path / "results")
-    finally:
-        datasets.DATASETS.pop("pairs", None)
+    numbers = {"width": WIDTH, "height": HEIGHT, "focal_px": 60, "right_m": 0.2}
+    (folder / "camera.json").write_text(json.dumps(numbers))
+    main_of(17)(tmp_path / "pairs", tmp_path / "results")
     table = (tmp_path / "results" / "tables.md").read_text()
     assert "My pairs" in table
+
+
+def test_the_example_of_own_photos(tmp_path: Path) -> None:
+    write_boxes(tmp_path / "boxes", 0)
+    photos = (tmp_path / "boxes" / "left.png", tmp_path / "boxes" / "right.png")
+    main_of(18)(*photos, "60", "0.2", "1.2", "3", str(tmp_path / "results"))
+    table = (tmp_path / "results" / "evaluation" / "tables.md").read_text()
+    assert "My garden" in table
 
 
 def test_examples_of_videos(scene: Path, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from spackle.bases.settings import AUTO_NETWORKS, RGBD
 from spackle.core.trajectories import TRAJECTORIES
 from spackle.depth.units import DEPTH_KINDS
 from spackle.inpaint.registry import INPAINTERS
+from spackle.paper.evaluation.datasets import DATASETS
 from spackle.paper.evaluation.method_descriptions import METHODS
 from spackle.paper.evaluation.metrics import METRICS
 from spackle.runtime.device import PRECISIONS
@@ -150,6 +151,8 @@ def test_help_names_everything_that_is_registered() -> None:
     for text in (build, evaluate):
         assert [name for name in INPAINTERS if name not in text] == []
     assert [name for name in (*METHODS, *METRICS) if name not in evaluate] == []
+    for text in (evaluate, bench):
+        assert [name for name in (*DATASETS, "package.module:NAME") if name not in text] == []
     weights = run("weights", "get", "--help").out
     assert [name for name in PUBLISHED_WEIGHTS if name not in weights] == []
 

@@ -28,7 +28,7 @@ from spackle.paper.dataset.inspect import find_problems
 from spackle.paper.dataset.photos import find_photos
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.evaluation.case import load_case
-from spackle.paper.evaluation.datasets import read_cases
+from spackle.paper.evaluation.datasets import find_dataset, read_cases
 from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.runtime.digests import json_digest
@@ -103,6 +103,7 @@ def _read_ply(folder: Path) -> None:
 
 
 def _read_tree(name: str, folder: Path) -> None:
+    find_dataset(name).described(folder)
     case = read_cases(name, folder)[0]
     load_case(case)
     for read in (case.read_depth, case.read_points):
@@ -149,6 +150,9 @@ READERS: dict[str, Callable[[Path], object]] = {
     "datasets": _read_dataset,
     "weights": _read_weights,
     "clips": _read_clip,
-    **{name: partial(_read_tree, name) for name in ("middlebury", "booster", "wildrgbd", "llff")},
+    **{
+        name: partial(_read_tree, name)
+        for name in ("middlebury", "booster", "wildrgbd", "llff", "pairs")
+    },
     "colmap": partial(_read_tree, "tanks"),
 }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -18,6 +16,7 @@ from spackle.cli.evaluation_options import (
     ResidualOption,
     ResultsOption,
     SideOption,
+    results_name,
 )
 from spackle.cli.options import (
     INTERRUPTED,
@@ -27,9 +26,6 @@ from spackle.cli.options import (
     SharpWindowsOption,
     VerboseOption,
 )
-
-# Runs of characters that a folder's name should not have.
-UNSAFE_IN_FOLDER_NAMES = re.compile(r"[^\w.-]+")
 
 
 def bench(
@@ -86,9 +82,7 @@ def bench(
         runs=runs,
         base_runs=base_runs,
     )
-    # The slash and colon of a base such as hf:OWNER/NAME become hyphens.
-    base_in_name = UNSAFE_IN_FOLDER_NAMES.sub("-", base)
-    results = output or Path(f"bench-{dataset}-{base_in_name}")
+    results = output or results_name("bench", dataset, base)
     # No result comes back from a run that the user has stopped.
     if run_bench(options, results, CommandReporter(verbose, as_json=as_json)) is None:
         raise typer.Exit(INTERRUPTED)

@@ -18,6 +18,7 @@ from spackle.cli.evaluation_options import (
     ResidualOption,
     ResultsOption,
     SideOption,
+    results_name,
 )
 from spackle.cli.options import (
     INPAINTERS,
@@ -126,7 +127,7 @@ def evaluate(
         download_metrics=download_metrics,
     )
     # The folder has the protocol in its name, so that runs of both protocols do not meet in it.
-    results = output or Path(f"evaluation-{dataset}-{protocol}")
+    results = output or results_name("evaluation", dataset, protocol)
     # No result comes back from a run that the user has stopped.
     if run_evaluation(options, results, CommandReporter(verbose, as_json=as_json), html) is None:
         raise typer.Exit(INTERRUPTED)

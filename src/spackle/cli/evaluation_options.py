@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from spackle.cli.options import DATASET_BASES
+from spackle.cli.options import DATASET_BASES, DATASETS
+
+# Runs of characters that a folder's name should not have.
+UNSAFE_IN_FOLDER_NAMES = re.compile(r"[^\w.-]+")
 
 LimitOption = Annotated[
     int | None,
@@ -16,7 +20,8 @@ LimitOption = Annotated[
 DatasetNameOption = Annotated[
     str,
     typer.Option(
-        metavar="NAME", help="Dataset: middlebury, booster, wildrgbd, tanks, eth3d or llff."
+        metavar="NAME",
+        help=f"Dataset: {DATASETS}; or package.module:NAME.",
     ),
 ]
 FolderArgument = Annotated[
@@ -64,3 +69,11 @@ ResultsOption = Annotated[
 HtmlOption = Annotated[
     bool, typer.Option("--html", help="Also write report.html, one page with all results.")
 ]
+
+
+def results_name(*words: str) -> Path:
+    """The default name of a folder of results: the words with hyphens between them.
+
+    The slash and the colon of a word such as hf:OWNER/NAME become hyphens, too.
+    """
+    return Path(UNSAFE_IN_FOLDER_NAMES.sub("-", "-".join(words)))

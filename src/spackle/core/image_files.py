@@ -31,6 +31,8 @@ HARMLESS_PIXELS = 32_000_000
 MAX_PIXELS_PER_BYTE = 32
 
 MAX_UINT16 = 65535
+_ORIENTATION_TAG = 0x0112  # of EXIF
+_SIDEWAYS_ORIENTATIONS = (5, 6, 7, 8)  # with rows and columns swapped
 _EXIF_DIRECTORY = 0x8769  # the tag that points to the directory with the camera's settings
 
 
@@ -106,6 +108,21 @@ def upright(image: Image.Image) -> Image.Image:
         return ImageOps.exif_transpose(image)
     except Exception:  # a stranger's EXIF can raise anything
         return image
+
+
+def upright_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """(width, height) in pixels of an image file, turned as its EXIF orientation asks.
+
+    Only the header is read. InputError if the file is missing, damaged, no image, or too large.
+    """
+
+    def read_size(image: Image.Image) -> tuple[int, int]:
+        """The size of the turned image."""
+        width, height = image.size
+        orientation = exif_tags(image).get(_ORIENTATION_TAG)
+        return (height, width) if orientation in _SIDEWAYS_ORIENTATIONS else (width, height)
+
+    return read_image(path, read_size)
 
 
 def exif_tags(image: Image.Image) -> dict[int, object]:

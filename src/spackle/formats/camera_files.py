@@ -133,6 +133,7 @@ def checked_camera(
     *,
     dtype: torch.dtype = torch.float32,
     tolerance: float = ROTATION_TOLERANCE,
+    pose_name: str = "world_to_camera",
 ) -> Camera:
     """Return a camera, after checking that its numbers make sense.
 
@@ -143,6 +144,7 @@ def checked_camera(
         where: names the camera at the beginning of messages.
         dtype: the type of the camera's matrices.
         tolerance: how far the rotation times its transpose may be from the identity.
+        pose_name: what the pose is called in messages.
 
     Raises:
         InputError: a side is outside of 1..16384 pixels, a matrix is not finite, K has skew or
@@ -154,9 +156,9 @@ def checked_camera(
         # Also false for NaN.
         if not bool((matrix.abs() <= MAX_CAMERA_NUMBER).all()):
             limits = f"finite, at most {MAX_CAMERA_NUMBER:g}"
-            raise InputError(f"{where}: numbers in K and world_to_camera must be {limits}")
+            raise InputError(f"{where}: numbers in K and {pose_name} must be {limits}")
     _check_intrinsics(K, where)
-    _check_pose(world_to_camera, tolerance, where)
+    _check_pose(world_to_camera, tolerance, f"{where}: {pose_name}")
     return Camera(K.to(dtype), world_to_camera.to(dtype), width, height)
 
 
@@ -173,10 +175,11 @@ def _check_intrinsics(K: Tensor, where: str) -> None:
         raise InputError(f"{where}: K must be {form}: skew is not supported")
 
 
-def _check_pose(world_to_camera: Tensor, tolerance: float, where: str) -> None:
+def _check_pose(world_to_camera: Tensor, tolerance: float, what: str) -> None:
     """Raise an InputError unless a matrix [4, 4] is a rotation and a translation.
 
-    The rotation times its transpose must equal the identity within `tolerance`.
+    The rotation times its transpose must equal the identity within `tolerance`; `what` begins the
+    message.
     """
     rotation = world_to_camera[:3, :3]
     identity = torch.eye(3, dtype=rotation.dtype)
@@ -187,7 +190,7 @@ def _check_pose(world_to_camera: Tensor, tolerance: float, where: str) -> None:
     last_row_error = (world_to_camera[3] - expected_last_row).abs().max()
     if rotation_error > tolerance or is_mirrored or last_row_error > ZERO_TOLERANCE:
         form = "a rotation (no scale, no mirror) and a translation, above a row 0 0 0 1"
-        raise InputError(f"{where}: world_to_camera must be {form}")
+        raise InputError(f"{what} must be {form}")
 
 
 def load_path(path: str | os.PathLike[str]) -> KeyframePath:

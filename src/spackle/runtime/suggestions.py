@@ -16,11 +16,12 @@ SECTION_WEIGHT = 0.1
 
 
 def closest_name(name: str, known_names: Iterable[str]) -> str | None:
-    """The most similar known name, or None if none is similar."""
+    """The most similar known name, whatever the case of letters; None if none is similar."""
+    by_lower_case = {known_name.lower(): known_name for known_name in known_names}
     similar = difflib.get_close_matches(
-        name.lower(), list(known_names), n=1, cutoff=MIN_NAME_SIMILARITY
+        name.lower(), list(by_lower_case), n=1, cutoff=MIN_NAME_SIMILARITY
     )
-    return similar[0] if similar else None
+    return by_lower_case[similar[0]] if similar else None
 
 
 def closest_key(key: str, known_keys: Sequence[str]) -> str | None:

@@ -56,7 +56,7 @@ from spackle.runtime.device import hardware_facts, package_versions
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import results_folder
-from spackle.runtime.plugins import load_plugin
+from spackle.runtime.plugins import is_plugin, load_function
 from spackle.runtime.progress import Reporter, pluralized
 from spackle.scene_fill import FillContext
 
@@ -305,12 +305,12 @@ def _methods(
 
     def plugin_method(name: str, cameras: Sequence[Camera]) -> Fill:
         """A method of another package, named `package.module:Name`, for all views of a setting."""
-        fill: Fill = load_plugin(name, "methods")(cameras, context)
+        fill: Fill = load_function(name, "methods")(cameras, context)
         return fill
 
     methods: dict[str, Method] = {}
     for name in evaluation.options.methods:
-        make_fill = plugin_method if ":" in name else built_in_method
+        make_fill = plugin_method if is_plugin(name) else built_in_method
         methods[name] = functools.partial(make_fill, name)
     return methods
 

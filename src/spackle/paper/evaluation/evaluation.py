@@ -13,7 +13,7 @@ from spackle.bases.open import OpenedBase, open_base, wrap_loaded_base
 from spackle.bases.settings import describe_base
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
 from spackle.paper.evaluation.case import Case, LoadedCase, SecondView, known_depth
-from spackle.paper.evaluation.datasets import DATASETS, read_cases
+from spackle.paper.evaluation.datasets import find_dataset, read_cases
 from spackle.paper.evaluation.datasets.multiview import evenly_spaced_items
 from spackle.paper.evaluation.metric_suite import MetricSuite
 from spackle.paper.evaluation.metrics import DEFAULT_METRICS, METRICS
@@ -190,7 +190,7 @@ def _configuration(
         inpainter: of the method inpaint2d.
         renderer: its device is recorded.
     """
-    dataset = DATASETS[options.dataset]
+    dataset = find_dataset(options.dataset).described(options.root)
     names_digest = json_digest([case.name for case in cases])
 
     # Weights are recorded by digest, because paths differ between machines.
@@ -201,7 +201,7 @@ def _configuration(
     config: dict[str, Any] = {
         "kind": "evaluate",
         "spackle": spackle.__version__,
-        "dataset": dataset.name,
+        "dataset": options.dataset,
         "title": dataset.title,
         "terms": dataset.terms,  # of use of the photos
         "images": {"count": len(cases), "limit": options.limit, "names": names_digest},

@@ -12,13 +12,13 @@ import torch
 from spackle.bases.settings import BaseSettings
 from spackle.core.photo import MAX_WORKING_SIDE_PX
 from spackle.core.trajectories import MAX_DISPARITY
-from spackle.paper.evaluation.datasets import DATASETS
+from spackle.paper.evaluation.datasets import find_dataset
 from spackle.paper.evaluation.method_descriptions import METHODS
 from spackle.paper.evaluation.metrics import METRICS
 from spackle.paper.evaluation.paper_numbers import PAPER_DISPARITIES
 from spackle.runtime.device import pick_device
 from spackle.runtime.errors import InputError, check_name
-from spackle.runtime.plugins import load_plugin
+from spackle.runtime.plugins import check_name_or_plugin, is_plugin, load_function
 
 Protocol = Literal["large-view", "near-view"]
 SecondViews = Literal["all", "nearest"]
@@ -41,7 +41,7 @@ class EvaluateOptions:
     with the residual network.
     """
 
-    dataset: str  # a key of `DATASETS`
+    dataset: str  # a key of `DATASETS`, or `package.module:NAME`
     root: Path  # the folder of the unpacked dataset
     # "large-view": camera moves to the left and right; "near-view": viewpoints of second photos.
     protocol: Protocol = "large-view"
@@ -96,7 +96,7 @@ class EvaluateOptions:
 
     def check(self) -> None:
         """Raise an InputError if an option cannot be used; the dataset's files are not read."""
-        check_name("dataset", self.dataset, DATASETS)
+        find_dataset(self.dataset)
         self._check_methods()
         self._check_metrics()
         # The base "auto" is refused: it depends on what is installed, and results with different
@@ -111,10 +111,9 @@ class EvaluateOptions:
         if not self.methods:
             raise InputError(f"`methods`: none is given: choose from {', '.join(METHODS)}")
         for method in self.methods:
-            if ":" in method:  # package.module:Name
-                load_plugin(method, "methods")
-            else:
-                check_name("methods", method, METHODS)
+            check_name_or_plugin("methods", method, METHODS)
+            if is_plugin(method):
+                load_function(method, "methods")
 
         # Direct FT trains SHARP's own weights, so no other base has such a file.
         has_tuned_base = self.base.name == "sharp" and self.direct_ft is not None
@@ -151,7 +150,7 @@ class EvaluateOptions:
 class BenchOptions:
     """The options of `spackle bench`, which counts added Gaussians and measures times."""
 
-    dataset: str  # a key of `DATASETS`
+    dataset: str  # a key of `DATASETS`, or `package.module:NAME`
     root: Path  # the folder of the unpacked dataset
     disparities: Sequence[float] = PAPER_DISPARITIES  # sizes of the camera moves
     base: BaseSettings = PAPER_BASE  # turns photos into Gaussians

@@ -151,6 +151,10 @@ LATEX_ESCAPES = {
 }  # fmt: skip
 
 
+# What a label should not have: LaTeX's own characters, which the title of a user's photos may have.
+UNSAFE_IN_LABELS = re.compile(r"[^\w:. -]+")
+
+
 def escape_latex(text: str) -> str:
     """Escape a text for LaTeX; text between ** becomes bold.
 
@@ -180,12 +184,13 @@ def to_latex(table: Table, label_suffix: str = "") -> str:
     # One letter for each column: words are left-aligned, numbers centred.
     number_columns = len(table.heads) - table.word_columns
     shape = "l" * table.word_columns + "c" * number_columns
+    label = UNSAFE_IN_LABELS.sub("-", f"{table.label}{label_suffix}")
     lines = [
         r"\begin{table*}[t]",
         r"\centering",
         r"\scriptsize",
         rf"\caption{{{escape_latex(table.caption)}}}",
-        rf"\label{{{table.label}{label_suffix}}}\smallskip",
+        rf"\label{{{label}}}\smallskip",
         r"\resizebox{\textwidth}{!}{",
         rf"\begin{{tabular}}{{{shape}}}",
         r"\toprule",

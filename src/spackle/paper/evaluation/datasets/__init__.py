@@ -1,7 +1,8 @@
 """The datasets of the evaluation, and the search for their scenes in a folder.
 
 To add a dataset: write a file in this folder that defines an `EvalDataset` (dataset.py says what
-that is; eth3d.py is the shortest), and add a line to `_ALL_DATASETS` below.
+that is; eth3d.py is the shortest), and add a line to `_ALL_DATASETS` below. A dataset that another
+package defines needs no line: its name is `package.module:NAME`.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ from spackle.paper.evaluation.datasets.dataset import EvalDataset
 from spackle.paper.evaluation.datasets.eth3d import ETH3D
 from spackle.paper.evaluation.datasets.llff import LLFF
 from spackle.paper.evaluation.datasets.middlebury import MIDDLEBURY
+from spackle.paper.evaluation.datasets.pairs import PAIRS
 from spackle.paper.evaluation.datasets.tanks import TANKS
 from spackle.paper.evaluation.datasets.wildrgbd import WILDRGBD
 from spackle.runtime.errors import InputError
+from spackle.runtime.plugins import check_name_or_plugin, is_plugin, load_plugin
 
-__all__ = ["DATASETS", "EvalDataset", "read_cases"]
+__all__ = ["DATASETS", "EvalDataset", "find_dataset", "read_cases"]
 
-# The paper's six datasets, in the order of its tables. A further dataset is a further line here.
+# The paper's six datasets, in the order of its tables, and the user's own photos. A further dataset
+# is a further line here.
 _ALL_DATASETS = (
     MIDDLEBURY,
     BOOSTER,
@@ -31,6 +35,7 @@ _ALL_DATASETS = (
     TANKS,
     ETH3D,
     LLFF,
+    PAIRS,
 )
 DATASETS: dict[str, EvalDataset] = {dataset.name: dataset for dataset in _ALL_DATASETS}
 
@@ -39,11 +44,28 @@ DATASETS: dict[str, EvalDataset] = {dataset.name: dataset for dataset in _ALL_DA
 MAX_SCENE_DEPTH = 4
 
 
+def find_dataset(name: str) -> EvalDataset:
+    """A dataset by its name: a key of `DATASETS`, or `package.module:NAME` of another package.
+
+    InputError if there is no such dataset.
+    """
+    check_name_or_plugin("dataset", name, DATASETS)
+    if not is_plugin(name):
+        return DATASETS[name]
+    dataset = load_plugin(name, "dataset")
+    if not isinstance(dataset, EvalDataset):
+        raise InputError(
+            f"`dataset` {name}: no dataset: give an EvalDataset of "
+            "spackle.paper.evaluation.datasets"
+        )
+    return dataset
+
+
 def read_cases(name: str, root: Path) -> list[Case]:
     """All cases (input photos with what is known about them) of a dataset's scenes in a folder.
 
     Args:
-        name: a key of `DATASETS`.
+        name: of the dataset, see `find_dataset`.
         root: the folder of the unpacked dataset, or a folder of it.
 
     Returns:
@@ -53,7 +75,7 @@ def read_cases(name: str, root: Path) -> list[Case]:
         InputError: there is no such folder, no scene (the message names the expected files) or no
             photo; two scenes have the same name; or a scene's files are missing or damaged.
     """
-    dataset = DATASETS[name]
+    dataset = find_dataset(name)
     if not root.is_dir():
         raise InputError(f"{root}: no such folder: give the folder of the unpacked dataset {name}")
     if root.name in ("", ".."):  # scenes are named after folders, so the path must end with a name

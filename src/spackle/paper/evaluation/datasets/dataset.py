@@ -15,6 +15,14 @@ def folder_name(folder: Path) -> str:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class DatasetDescription:
+    """What results say about the photos of a dataset."""
+
+    title: str
+    terms: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class EvalDataset:
     """A dataset in the layout of files in which it is published.
 
@@ -25,6 +33,8 @@ class EvalDataset:
     name: str  # for the option `dataset`
     title: str  # in tables; for the paper's datasets their name in the paper's tables
     terms: str  # terms of use, in a few words
+    # Reads title and terms from the root folder, if it is the user who gives them; else None.
+    describe: Callable[[Path], DatasetDescription] | None = None
     # A folder is a scene if it holds one of these files or folders.
     markers: Sequence[str]
     expected: str  # the files of a scene, for messages
@@ -34,3 +44,10 @@ class EvalDataset:
     skipped_folders: Sequence[str] = ()
     # From a scene's folder to a name that no other scene has.
     scene_name: Callable[[Path], str] = folder_name
+
+    def described(self, root: Path) -> EvalDataset:
+        """This dataset, with the title and terms that its folder `root` gives, if it gives any."""
+        if self.describe is None:
+            return self
+        description = self.describe(root)
+        return dataclasses.replace(self, title=description.title, terms=description.terms)

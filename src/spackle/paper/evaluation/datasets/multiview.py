@@ -77,6 +77,7 @@ def camera_from_pose(
         where,
         dtype=torch.float64,
         tolerance=ROTATION_TOLERANCE,  # published poses are rounded
+        pose_name="camera_to_world",
     )
     return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(camera_to_world))
 

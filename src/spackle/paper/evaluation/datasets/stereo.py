@@ -44,7 +44,7 @@ def rectified_pair(
     right: Path,
     calibration: Calibration,
     size: tuple[int, int] | None,
-    read_depth: Callable[[], DepthMap],
+    read_depth: Callable[[], DepthMap] | None,
 ) -> Case:
     """The case of a left photo, with the right photo as its second view.
 
@@ -55,7 +55,7 @@ def rectified_pair(
         calibration: of the pair; (0, 0) is the corner of the first pixel.
         size: (width, height) of the photos in pixels; None: they cannot be read. Then the case has
             no second view, and its evaluation reports why the photo cannot be read.
-        read_depth: reads the left photo's depth.
+        read_depth: reads the left photo's depth; None: it is unknown.
     """
     if size is None:
         return Case(name=name, photo=left, read_depth=read_depth)
