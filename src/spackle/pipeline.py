@@ -25,7 +25,6 @@ from spackle.bases.open import OpenedBase, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.keyframes import KeyframePath
 from spackle.core.photo import Photo, check_photo_size
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
@@ -38,7 +37,7 @@ from spackle.scene import Scene, SceneReport, ViewHoles
 from spackle.scene_fill.context import FillContext
 from spackle.scene_fill.fill import fill_scene, fill_view
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
-from spackle.views import PathOptions, PlannedViews, choose_disparity, plan_views
+from spackle.views import GivenPath, PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed_weights
 
 # Where the texture in the holes comes from; see `open_texture`.
@@ -162,8 +161,8 @@ class Pipeline:
     base: OpenedBase
     network: ResidualNet | None  # None: holes are filled without a network
     renderer: Renderer
-    given_views: list[Camera] | None = None  # the views of `options.path.cameras`, if given
-    keyframes: KeyframePath | None = None  # those of `options.path.path`, if given
+    # What the files `options.path.cameras` and `options.path.path` hold, if they are given.
+    given_path: GivenPath = dataclasses.field(default_factory=GivenPath)
 
     @staticmethod
     def open(options: PipelineOptions) -> Pipeline:
@@ -178,14 +177,13 @@ class Pipeline:
         network = options.fill.load_network()
         # Only to find missing weights of LaMa before long work; `_fill_holes` opens it again.
         open_texture(options.fill.texture)
-        given_views, keyframes = options.path.load()
+        given_path = options.path.load()
         return Pipeline(
             options=options,
             base=open_base(options.base),
             network=network,
             renderer=get_renderer(options.base.device),
-            given_views=given_views,
-            keyframes=keyframes,
+            given_path=given_path,
         )
 
     def complete(self, photo: Photo, reporter: Reporter) -> CompletedPhoto:
@@ -198,14 +196,18 @@ class Pipeline:
         Raises:
             InputError: the photo or its depth map cannot be used.
         """
+        # A file of cameras may know the photo's lens, and where the photo stands among its views.
+        photo = self.given_path.with_lens(photo)
+        given = self.given_path.around_photo(photo.path.name)
+        for line in given.notes:
+            reporter.log(line)
+
         # photo --> base --> Gaussians
         predicted = self.predict(photo, reporter)
         prediction = predicted.prediction
 
         # camera path --> views
-        views = plan_views(
-            prediction, self.options.path, photo.path, self.given_views, self.keyframes
-        )
+        views = plan_views(prediction, self.options.path, photo.path, given.views, given.keyframes)
 
         # render --> holes --> fill --> aux
         with reporter.stage("complete") as progress:
@@ -270,7 +272,7 @@ class Pipeline:
             warn(f"{name}: {base.note}")
 
         # Views and keyframes that the user gives say themselves where the camera goes.
-        follows_trajectory = self.given_views is None and self.keyframes is None
+        follows_trajectory = not self.given_path.replaces_trajectory
         chooses_disparity = follows_trajectory and self.options.path.disparity is None
         if chooses_disparity:
             with reporter.stage("move"):  # the stage's published name in the report's times
@@ -305,7 +307,7 @@ class Pipeline:
 
     def _path_disparity(self, prediction: BasePrediction) -> float | None:
         """How far the camera moves along the trajectory; None for given views or keyframes."""
-        if self.given_views is not None or self.keyframes is not None:
+        if self.given_path.replaces_trajectory:
             return None
         return self.options.path.disparity_or(prediction.max_disparity)
 
@@ -362,7 +364,8 @@ class Pipeline:
         filled = fill_scene(
             context,
             cameras,
-            exact=self.given_views is not None,  # between given views nothing will be rendered
+            # Between given views nothing will be rendered.
+            exact=self.given_path.cameras is not None,
             progress=progress,
             always_filled=always_filled_positions,
         )

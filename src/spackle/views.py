@@ -16,9 +16,10 @@ import torch
 
 from spackle.bases import DEFAULT_MAX_DISPARITY, BasePrediction
 from spackle.core.camera import Camera
+from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
 from spackle.core.keyframes import KeyframePath, PathError
-from spackle.core.photo import working_size
+from spackle.core.photo import Photo, working_size
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     MAX_DISPARITY,
@@ -28,11 +29,14 @@ from spackle.core.trajectories import (
     leftmost_and_rightmost,
     trajectory_cameras,
 )
-from spackle.formats.camera_files import load_cameras, load_path
+from spackle.formats.camera_files import load_path
+from spackle.formats.camera_readers import is_path_file, read_camera_set
+from spackle.formats.camera_set import CameraSet
+from spackle.formats.scene_content import SceneFile
 from spackle.render.protocol import Renderer
 from spackle.residual.features import hole_area_ratio
 from spackle.runtime.errors import InputError, as_input_error, check_name
-from spackle.video.frames import FrameMaker
+from spackle.video.frames import SAME_ASPECT_TOLERANCE, FrameMaker
 from spackle.video.options import VideoOptions
 
 DEFAULT_FRAME_COUNT = 60  # cameras of `Scene.path`; of a longer path, 60 to 119 frames are filled
@@ -55,8 +59,10 @@ class PathOptions:
 
     trajectory: TrajectoryKind = "rotate-forward"
     disparity: float | None = None  # size of the camera's movement; None: chosen for the photo
-    cameras: Path | None = None  # a file of views that replace the trajectory
-    path: Path | None = None  # a file of keyframes that replace the trajectory
+    # A file of views, or a folder of COLMAP's, that replace the trajectory.
+    cameras: Path | None = None
+    # A file of keyframes that replace the trajectory, or cameras of another program.
+    path: Path | None = None
     frames: int | None = None  # number of video frames; None: `seconds` times the frame rate
     seconds: float | None = None  # duration of the video; None: 4, or the keyframes' duration
     video: VideoOptions = dataclasses.field(default_factory=VideoOptions)
@@ -116,14 +122,15 @@ class PathOptions:
                 "leave `size` out"
             )
 
-    def load(self) -> tuple[list[Camera] | None, KeyframePath | None]:
-        """Read the files of the options: the views of `cameras`, and the keyframes of `path`.
-
-        Each is None if the option is not given. InputError for a file that cannot be used.
-        """
-        given_views = None if self.cameras is None else load_cameras(self.cameras)
-        keyframes = None if self.path is None else load_path(self.path)
-        return given_views, keyframes
+    def load(self) -> GivenPath:
+        """Read the files of `cameras` and `path`; InputError for one that cannot be used."""
+        if self.cameras is not None:
+            return GivenPath(cameras=read_camera_set(self.cameras))
+        if self.path is None:
+            return GivenPath()
+        if is_path_file(self.path):
+            return GivenPath(keyframes=load_path(self.path))
+        return GivenPath(path_cameras=read_camera_set(self.path))
 
     def disparity_or(self, default: float) -> float:
         """The size of the camera's movement: the option's value, or else the default."""
@@ -191,6 +198,84 @@ class PathOptions:
                 "give `frames`"
             )
         return keyframes.cameras(camera.even(), frame_count, DepthRange.of(gaussians))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PathInWorld:
+    """The views or keyframes of a user, in the world of a photo or scene."""
+
+    views: list[Camera] | None = None
+    keyframes: KeyframePath | None = None
+    notes: list[str] = dataclasses.field(default_factory=list)  # lines for the user
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GivenPath:
+    """What the files of the options `cameras` and `path` hold; nothing if none is given."""
+
+    cameras: CameraSet | None = None  # the views
+    keyframes: KeyframePath | None = None
+    path_cameras: CameraSet | None = None  # another program's cameras, through which a path leads
+
+    @property
+    def replaces_trajectory(self) -> bool:
+        """Whether a file says where the camera goes."""
+        sources = (self.cameras, self.keyframes, self.path_cameras)
+        return any(source is not None for source in sources)
+
+    def with_lens(self, photo: Photo) -> Photo:
+        """The photo with the focal length that the file of cameras gives, if it names the photo.
+
+        A focal length that the user gives stays. So does that of a photo without its uniform frame,
+        or with other proportions than the file says: it may have been cropped since.
+        """
+        cameras = self.cameras or self.path_cameras
+        lens = None if cameras is None else cameras.lens_of(photo.path.name)
+        if lens is None or photo.focal_source.is_from_user or photo.frame is not None:
+            return photo
+        scale_across = photo.width / lens.width
+        scale_down = photo.height / lens.height
+        if abs(scale_across / scale_down - 1) > SAME_ASPECT_TOLERANCE:
+            return photo
+        focal_px = lens.focal[0] * scale_across
+        return dataclasses.replace(photo, focal_px=focal_px, focal_source=FocalSource.CAMERAS)
+
+    def around_photo(self, photo_name: str) -> PathInWorld:
+        """The views or keyframes in the world of a photo's camera; the file may name the photo."""
+        return self._in_world(lambda cameras: cameras.around_photo(photo_name))
+
+    def in_scene(self, scene: SceneFile, photo_name: str) -> PathInWorld:
+        """The views or keyframes in the world of a saved scene.
+
+        A scene that was made of a photo has the photo's camera at its origin. Another program's
+        scene has a world of its own, and cameras of other programs are taken to share it.
+
+        Args:
+            scene: the scene.
+            photo_name: what its photo was called.
+        """
+        if scene.camera is not None:
+            return self.around_photo(photo_name)
+
+        def in_shared_world(cameras: CameraSet) -> CameraSet:
+            """The cameras as they are, with a note."""
+            if cameras.origin is None:
+                return cameras
+            note = f"its world is taken as that of {scene.path.name}"
+            return dataclasses.replace(cameras, notes=(*cameras.notes, note))
+
+        return self._in_world(in_shared_world)
+
+    def _in_world(self, change_world: Callable[[CameraSet], CameraSet]) -> PathInWorld:
+        """The views or keyframes after a change of the cameras' world."""
+        if self.cameras is not None:
+            cameras = change_world(self.cameras)
+            return PathInWorld(views=cameras.views(), notes=cameras.lines)
+        if self.path_cameras is not None:
+            cameras = change_world(self.path_cameras)
+            with as_input_error(cameras.source, "{reason}", PathError):
+                return PathInWorld(keyframes=cameras.path(), notes=cameras.lines)
+        return PathInWorld(keyframes=self.keyframes)
 
 
 class DisparityTrial(NamedTuple):

@@ -109,15 +109,18 @@ PathFileOption = Annotated[
     Path | None,
     typer.Option(
         "--path",
-        metavar="FILE.json",
+        metavar="FILE",
         hidden=True,
-        help="Keyframes of a path, see docs/video.md.",
+        help="Keyframes of a path, see docs/video.md; or cameras as those of --cameras.",
     ),
 ]
 CamerasOption = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE.json", hidden=True, help="Complete the views in a file instead of a path."
+        metavar="FILE",
+        hidden=True,
+        help="Complete the views in a file instead of a path: Spackle's, transforms.json of "
+        "nerfstudio, cameras.json of 3DGS, a COLMAP folder and others, see docs/inputs.md.",
     ),
 ]
 FramesOption = Annotated[

@@ -47,6 +47,7 @@ class FocalSource(enum.Enum):
     FOCAL_PX = "focal_px"  # given by the user, like the next two
     FOCAL_MM = "focal_mm"
     FOV = "fov"
+    CAMERAS = "cameras"  # of a file of cameras that names the photo
     EXIF = "EXIF"  # read from the photo's file
     CALIBRATION = "calibration"  # measured, in a file beside the photo
     DATASET = "dataset"  # the camera of a dataset for evaluation
@@ -56,7 +57,8 @@ class FocalSource(enum.Enum):
     @property
     def is_from_user(self) -> bool:
         """Whether the user gave the focal length, so that nothing may change it."""
-        return self in (FocalSource.FOCAL_PX, FocalSource.FOCAL_MM, FocalSource.FOV)
+        given = (FocalSource.FOCAL_PX, FocalSource.FOCAL_MM, FocalSource.FOV, FocalSource.CAMERAS)
+        return self in given
 
     @property
     def is_assumed(self) -> bool:

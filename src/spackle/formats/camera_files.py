@@ -1,6 +1,7 @@
-"""JSON files of cameras: views to render, or keyframes of a path.
+"""Spackle's JSON files of cameras: views to render, or keyframes of a path.
 
-`load_cameras` and `load_path` read files; `checked_camera` makes a camera of matrices.
+`load_cameras` and `load_path` read files; `checked_camera` makes a camera of matrices. Camera files
+of other programs are read by `camera_readers.py`.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.depth.calibration import calibration_candidates
 from spackle.depth.readers import find_depth_file
 from spackle.depth.writers import check_depth_name
+from spackle.formats.camera_readers import camera_source_files
 from spackle.pipeline import Pipeline, PipelineOptions
 from spackle.render.blend import blend_tiles
 from spackle.results.photo_folder import (
@@ -64,8 +65,8 @@ class PredictOptions:
                     raise InputError(
                         f"`{option}`: `no_render` writes no video: leave one of them out"
                     )
-        elif pipeline.given_views:
-            problem = video_problem(pipeline.given_views)
+        elif pipeline.given_path.cameras is not None:
+            problem = video_problem(pipeline.given_path.cameras.views())
             if problem:
                 raise InputError(
                     f"{path.cameras}: {problem}, so no video can be made: "
@@ -436,8 +437,6 @@ def _shared_digest(options: PredictOptions) -> str:
     fill = options.scene.fill
     files: dict[str, Path | None] = {
         "calibration": base.calib,
-        "camera file": path.cameras,
-        "path file": path.path,
         "weights": fill.weights_file,
         "LaMa": installed_weights("lama") if fill.texture == "lama" else None,
         **base.model_files,
@@ -445,6 +444,12 @@ def _shared_digest(options: PredictOptions) -> str:
     fingerprints = {
         kind: file_fingerprint(file, kind) for kind, file in files.items() if file is not None
     }
+
+    # Cameras of other programs may be in several files.
+    for kind, source in {"camera file": path.cameras, "path file": path.path}.items():
+        if source is not None:
+            sources = camera_source_files(source)
+            fingerprints[kind] = " ".join(file_fingerprint(file, kind) for file in sources)
 
     # A file counts by its content, which is in `fingerprints`, not by its path: a folder of photos
     # and weights may be moved. So options that name a file are emptied here.

@@ -233,7 +233,9 @@ def _video_name(pipeline: Pipeline) -> str:
 def _picture_names(pipeline: Pipeline) -> list[str]:
     """The names of the pictures of given views; empty for a path."""
     names: list[str] = []
-    for index in range(len(pipeline.given_views or [])):
+    given_cameras = pipeline.given_path.cameras
+    view_count = 0 if given_cameras is None else len(given_cameras.cameras)
+    for index in range(view_count):
         names += [f"{index:04d}.png", f"{index:04d}_base.png", f"{index:04d}_mask.png"]
     return names
 

@@ -222,9 +222,12 @@ def _open_scene_video(
 
     InputError if the scene or a file of cameras cannot be used, or the scene allows no path.
     """
-    given_views, keyframes = path.load()
+    given_path = path.load()
     loaded = load_scene(scene_file)
     log_losses(loaded, reporter)
+    given = given_path.in_scene(loaded, page_name(scene_file))
+    for line in given.notes:
+        reporter.log(line)
     scene = Scene.of_file(loaded, path.video.size, focal_px=focal_px, fov=fov)
     gaussian_sets = _sets_to_render(scene, scene_file, compare=path.video.compare)
 
@@ -240,19 +243,19 @@ def _open_scene_video(
         as_input_error(scene_file, NO_PATH_MESSAGE, ValueError),
         as_input_error(path.path, "{reason}", PathError),
     ):
-        cameras = given_views or path.video_cameras(
-            scene.base, scene.camera, keyframes, scene.disparity
+        cameras = given.views or path.video_cameras(
+            scene.base, scene.camera, given.keyframes, scene.disparity
         )
 
     _say_if_beyond_completion(scene, scene_file, path, reporter)
-    if not given_views and loaded.camera is None and not has_new_lens:
+    if not given.views and loaded.camera is None and not has_new_lens:
         reporter.log(
             f"{scene_file.name}: no camera stored: {ASSUMED_FOCAL_MM:g} mm assumed, "
             "`fov` gives another lens"
         )
     return SceneVideo(
         cameras=cameras,
-        has_given_views=bool(given_views),
+        has_given_views=bool(given.views),
         frame_maker=FrameMaker.of(path.video, scene.base, cameras, scene_file),
         gaussian_sets=gaussian_sets,
         gaussian_count=len(loaded.gaussians),

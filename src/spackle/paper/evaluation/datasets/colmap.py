@@ -1,8 +1,8 @@
 """Read COLMAP models, text or binary: cameras, points, and the points that each photo sees.
 
 A model is a sparse reconstruction in three files: cameras (lenses), images (a pose for each
-photo, and where the photo sees points) and points3D. `read_model` reads all three; a generator
-below reads the records of each file.
+photo, and where the photo sees points) and points3D. `read_model` reads all three; the records of
+the first two are read by `formats/colmap.py`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,18 @@ import torch
 from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
-from spackle.core.gaussians import quat_to_matrix
 from spackle.formats.camera_files import MAX_CAMERA_NUMBER, checked_camera
+from spackle.formats.colmap import (
+    DAMAGED,
+    ImageRecord,
+    Lens,
+    images_path,
+    is_binary_model,
+    pose_of_image,
+    read_images,
+    read_lenses,
+    text_lines,
+)
 from spackle.paper.evaluation.case import Points
 from spackle.runtime.errors import InputError, as_input_error
 
@@ -30,52 +40,6 @@ Array = NDArray[Any]
 MAX_DISTORTION_RATIO = 0.02
 MAX_REPROJECTION_ERROR_PX = 2.0  # of a point, as mean over photos
 MAX_EXACT_INTEGER = 2**53  # the largest id that float64 holds exactly
-MIN_QUATERNION_NORM = 1e-6
-
-# Where the model of a scene lies; those in dense/ are from COLMAP's undistorter.
-MODEL_FOLDERS = ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse")
-DAMAGED = "not a COLMAP file ({reason}): the file is missing, damaged or cut off"
-
-
-class LensModel(NamedTuple):
-    """A kind of lens in COLMAP."""
-
-    name: str
-    parameter_count: int
-
-
-# By COLMAP's number of the lens model; others are too far from a pinhole.
-LENS_MODELS = {
-    0: LensModel("SIMPLE_PINHOLE", 3),
-    1: LensModel("PINHOLE", 4),
-    2: LensModel("SIMPLE_RADIAL", 4),
-    3: LensModel("RADIAL", 5),
-    4: LensModel("OPENCV", 8),
-}
-# Lens models with one focal length; the others have fx and fy.
-SINGLE_FOCAL_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-
-# Where a photo sees a point; the id -1 means that the position belongs to no point.
-OBSERVATION_DTYPE = np.dtype([("uv", "<f8", (2,)), ("id", "<i8")])
-
-
-class CameraRecord(NamedTuple):
-    """A lens in the file of cameras."""
-
-    key: int
-    model: int | str  # a key of `LENS_MODELS` in binary files, its name in text files
-    width: int
-    height: int
-    parameters: list[float]
-
-
-class ImageRecord(NamedTuple):
-    """A photo in the file of images."""
-
-    pose: list[float]  # world-to-camera: a quaternion wxyz, and a translation
-    camera_key: int
-    name: str
-    observations: Array  # [n] of `OBSERVATION_DTYPE`
 
 
 class PointRecord(NamedTuple):
@@ -120,21 +84,6 @@ class Model:
         return Points(uv.float()[is_in_front], z.float()[is_in_front])
 
 
-def model_folder(scene: Path) -> Path:
-    """The folder of a scene's model: sparse/0 or sparse, in the scene or in dense/.
-
-    Raises:
-        InputError: none of these has a file of cameras.
-    """
-    for name in MODEL_FOLDERS:
-        folder = scene / name
-        if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
-            return folder
-    raise InputError(
-        f"{scene / 'sparse/0'}: no COLMAP model: expected cameras, images, points3D as .bin or .txt"
-    )
-
-
 def read_model(folder: Path) -> Model:
     """Read a model's cameras, images and points.
 
@@ -143,26 +92,20 @@ def read_model(folder: Path) -> Model:
     Raises:
         InputError: a file is missing or damaged, or a lens differs too much from a pinhole.
     """
-    is_binary = (folder / "cameras.bin").is_file()
-    suffix = ".bin" if is_binary else ".txt"
-
+    is_binary = is_binary_model(folder)
     # Each file has its own block, so that a message names the damaged file.
-    points_path = folder / f"points3D{suffix}"
+    points_path = folder / f"points3D{'.bin' if is_binary else '.txt'}"
     with as_input_error(points_path, DAMAGED):
         point_records = _points_bin(points_path) if is_binary else _points_txt(points_path)
         point_ids, xyz = _reliable_points(point_records)
 
-    cameras_path = folder / f"cameras{suffix}"
-    with as_input_error(cameras_path, DAMAGED):
-        camera_records = _cameras_bin(cameras_path) if is_binary else _cameras_txt(cameras_path)
-        lenses = {record.key: _lens_of_record(cameras_path, record) for record in camera_records}
-
-    images_path = folder / f"images{suffix}"
-    with as_input_error(images_path, DAMAGED):
-        image_records = _images_bin(images_path) if is_binary else _images_txt(images_path)
+    lenses = read_lenses(folder)
+    for lens in lenses.values():
+        _check_distortion(folder, lens)
+    with as_input_error(images_path(folder), DAMAGED):
         views = [
-            _view_of_record(images_path, lenses[record.camera_key], record)
-            for record in image_records
+            _view_of_record(images_path(folder), lenses[record.camera_key].camera, record)
+            for record in read_images(folder)
         ]
 
     views.sort(key=lambda view: view.name)
@@ -188,56 +131,28 @@ def _reliable_points(records: Iterator[PointRecord]) -> tuple[Array, Array]:
     return ids.astype(np.int64), table[first_rows, 1:4]
 
 
-def _lens_of_record(path: Path, record: CameraRecord) -> Camera:
-    """The lens of a record as a float64 camera at the world's origin.
+def _check_distortion(folder: Path, lens: Lens) -> None:
+    """Raise an InputError if a lens distorts the corners of photos too much.
 
     Args:
-        path: the file, for messages.
-        record: the lens.
-
-    Raises:
-        InputError: the lens model is no pinhole, or distorts the corners of photos too much.
+        folder: of the model, for messages.
+        lens: the lens.
     """
-    model = _lens_model(record.model)
-    if model is None or len(record.parameters) != model.parameter_count:
-        raise InputError(
-            f"{path}: camera model {record.model} is not a pinhole: undistort the photos with "
-            "COLMAP first"
-        )
-
-    # Models with one focal length have f, cx, cy; the others fx, fy, cx, cy. Then comes distortion.
-    parameters = record.parameters
-    if model.name in SINGLE_FOCAL_MODELS:
-        parameters = [parameters[0], *parameters]  # fx and fy are the same
-    fx, fy, cx, cy, *distortion = parameters
-
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    at_origin = torch.eye(4, dtype=torch.float64)
-    lens = checked_camera(
-        K, at_origin, record.width, record.height, f"{path}: a lens", dtype=torch.float64
-    )
-
     # Distortion grows outwards, so the corner that is farthest from the principal point decides.
     # Divided by the focal lengths, its distance is in the units of the distortion's formulas.
-    corner_x = max(cx, record.width - cx) / fx
-    corner_y = max(cy, record.height - cy) / fy
+    fx, fy = lens.camera.focal
+    cx, cy = lens.camera.K[:2, 2].tolist()
+    corner_x = max(cx, lens.camera.width - cx) / fx
+    corner_y = max(cy, lens.camera.height - cy) / fy
     squared_radius = corner_x**2 + corner_y**2
-    shift = _max_distortion_shift(distortion, squared_radius)
-    max_shift_px = MAX_DISTORTION_RATIO * max(record.width, record.height)
+    shift = _max_distortion_shift(lens.distortion, squared_radius)
+    max_shift_px = MAX_DISTORTION_RATIO * max(lens.camera.width, lens.camera.height)
     is_small = shift * max(fx, fy) <= max_shift_px  # false for NaN
     if not is_small:
+        cameras_path = folder / f"cameras{images_path(folder).suffix}"
         raise InputError(
-            f"{path}: the camera distorts the corners of photos: undistort the photos first"
+            f"{cameras_path}: the camera distorts the corners of photos: undistort the photos first"
         )
-    return lens
-
-
-def _lens_model(number_or_name: int | str) -> LensModel | None:
-    """The lens model with COLMAP's number or name; None if it is too far from a pinhole."""
-    for number, model in LENS_MODELS.items():
-        if number_or_name in (number, model.name):
-            return model
-    return None
 
 
 def _max_distortion_shift(distortion: Sequence[float], squared_radius: float) -> float:
@@ -270,17 +185,8 @@ def _view_of_record(path: Path, lens: Camera, record: ImageRecord) -> ColmapView
     Raises:
         InputError: the pose is no rotation and translation.
     """
-    quaternion = torch.tensor(record.pose[:4], dtype=torch.float64)
-    translation = torch.tensor(record.pose[4:], dtype=torch.float64)
+    world_to_camera = pose_of_image(record, str(path))
     where = f"{path}: the pose of {record.name}"
-    # A quaternion of length 0, infinity or NaN has no direction, and so gives no rotation.
-    has_length = MIN_QUATERNION_NORM < float(quaternion.norm()) < MAX_CAMERA_NUMBER
-    if len(translation) != 3 or not has_length:
-        raise InputError(f"{where} is not a rotation: the file is damaged")
-
-    world_to_camera = torch.eye(4, dtype=torch.float64)
-    world_to_camera[:3, :3] = quat_to_matrix(quaternion)
-    world_to_camera[:3, 3] = translation
     camera = checked_camera(
         lens.K, world_to_camera, lens.width, lens.height, where, dtype=torch.float64
     )
@@ -294,46 +200,6 @@ def _view_of_record(path: Path, lens: Camera, record: ImageRecord) -> ColmapView
 
 
 # --- the records of binary files: little endian; a file begins with the number of its records
-
-
-def _cameras_bin(path: Path) -> Iterator[CameraRecord]:
-    """Yield the lenses of a cameras.bin.
-
-    A record is key (int32), model (int32), width, height (uint64), parameters (float64).
-    """
-    data = path.read_bytes()
-    (count,) = struct.unpack_from("<Q", data)
-    offset = 8  # bytes of the number of records
-    for _ in range(count):
-        key, model, width, height = struct.unpack_from("<iiQQ", data, offset)
-        # The caller refuses other models, so their parameters, of unknown number, are not read.
-        parameter_count = LENS_MODELS[model].parameter_count if model in LENS_MODELS else 0
-        parameters_start = offset + 24  # 4 + 4 + 8 + 8 bytes
-        parameters = struct.unpack_from(f"<{parameter_count}d", data, parameters_start)
-        yield CameraRecord(key, model, width, height, list(parameters))
-        offset = parameters_start + 8 * parameter_count  # a float64 has 8 bytes
-
-
-def _images_bin(path: Path) -> Iterator[ImageRecord]:
-    """Yield the photos of an images.bin.
-
-    A record is key (int32), quaternion wxyz and translation (7 float64), camera's key (int32), the
-    name with a zero byte, the number of observations (uint64), and these (x, y float64, id int64).
-    """
-    data = path.read_bytes()
-    (count,) = struct.unpack_from("<Q", data)
-    offset = 8  # bytes of the number of records
-    for _ in range(count):
-        _, *pose, camera_key = struct.unpack_from("<i7di", data, offset)
-        name_start = offset + 64  # 4 + 7 · 8 + 4 bytes
-        name_end = data.index(b"\0", name_start)
-        name = data[name_start:name_end].decode("utf-8", "replace")
-
-        (observation_count,) = struct.unpack_from("<Q", data, name_end + 1)
-        observations_start = name_end + 9  # the zero byte and the number of observations
-        observations = np.frombuffer(data, OBSERVATION_DTYPE, observation_count, observations_start)
-        yield ImageRecord(pose, camera_key, name, observations)
-        offset = observations_start + observation_count * OBSERVATION_DTYPE.itemsize
 
 
 def _points_bin(path: Path) -> Iterator[PointRecord]:
@@ -352,54 +218,9 @@ def _points_bin(path: Path) -> Iterator[PointRecord]:
         offset += 51 + 8 * photo_count  # 8 + 3 · 8 + 3 + 8 + 8 bytes, and the photos
 
 
-# --- the records of text files: lines of words; lines with # are comments
-
-
-def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a text file without comments."""
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for line in file:
-            if not line.startswith("#"):
-                yield line.rstrip("\n")
-
-
-def _cameras_txt(path: Path) -> Iterator[CameraRecord]:
-    """Yield the lenses of a cameras.txt: key, model's name, width, height, parameters."""
-    for line in _lines(path):
-        if not line.strip():
-            continue
-        key, model, width, height, *parameters = line.split()
-        numbers = [float(parameter) for parameter in parameters]
-        yield CameraRecord(int(key), model, int(width), int(height), numbers)
-
-
-def _images_txt(path: Path) -> Iterator[ImageRecord]:
-    """Yield the photos of an images.txt.
-
-    Each photo has two lines. The first has key, quaternion wxyz, translation, the camera's key and
-    the photo's name. The second has x, y and the point's id for each observation; it is empty if
-    the photo sees no point.
-    """
-    lines = _lines(path)
-    for line in lines:
-        if not line.strip():
-            continue
-        _, *pose, camera_key, name = line.split(maxsplit=9)  # 10 words; a name may have spaces
-
-        # The second line; at the file's end it may be missing instead of empty.
-        words = next(lines, "").split()
-        numbers = np.array(words, np.float64).reshape(-1, 3)
-        observations = np.empty(len(numbers), OBSERVATION_DTYPE)
-        observations["uv"] = numbers[:, :2]
-        observations["id"] = numbers[:, 2]
-        yield ImageRecord(
-            [float(word) for word in pose], int(camera_key), name.strip(), observations
-        )
-
-
 def _points_txt(path: Path) -> Iterator[PointRecord]:
     """Yield the points of a points3D.txt: key, x, y, z, 3 colours, error in pixels, photos."""
-    for line in _lines(path):
+    for line in text_lines(path):
         if not line.strip():
             continue
         key, x, y, z, _, _, _, error_px, *_ = line.split(maxsplit=8)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
 from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.formats.colmap import model_folder
 from spackle.paper.evaluation.case import Case
-from spackle.paper.evaluation.datasets.colmap import model_folder, read_model
+from spackle.paper.evaluation.datasets.colmap import read_model
 from spackle.paper.evaluation.datasets.dataset import EvalDataset
 from spackle.paper.evaluation.datasets.multiview import (
     PosedPhoto,

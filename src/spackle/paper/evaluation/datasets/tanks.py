@@ -6,8 +6,9 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
+from spackle.formats.colmap import model_folder
 from spackle.paper.evaluation.case import Case
-from spackle.paper.evaluation.datasets.colmap import model_folder, read_model
+from spackle.paper.evaluation.datasets.colmap import read_model
 from spackle.paper.evaluation.datasets.dataset import EvalDataset
 from spackle.paper.evaluation.datasets.multiview import (
     PosedPhoto,
