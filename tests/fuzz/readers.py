@@ -18,10 +18,12 @@ from pathlib import Path
 from helpers import DATA
 
 from spackle.clips.files import clip_frames, is_clip, read_clip
+from spackle.core.keyframes import PathError
 from spackle.core.photo import load_photo, resize_photo
 from spackle.depth.in_photo.layouts import load_photo_depth
 from spackle.depth.readers import load_depth
 from spackle.formats import PlyFile, load_cameras, load_path
+from spackle.formats.camera_readers import camera_source_files, is_path_file, read_camera_set
 from spackle.formats.scene_files import load_scene
 from spackle.paper.dataset import DatasetFiles
 from spackle.paper.dataset.inspect import find_problems
@@ -102,6 +104,33 @@ def _read_ply(folder: Path) -> None:
         read(PlyFile(_only(folder)))
 
 
+def _read_foreign_scene(folder: Path) -> None:
+    names = [path.name for path in folder.iterdir()]
+    scene = folder if "meta.json" in names else folder / min(names, key=lambda name: name[-3:])
+    for name in names:
+        if name.endswith("gltf"):
+            scene = folder / name
+    for loss in load_scene(scene).losses:
+        _say(loss)
+
+
+def _read_foreign_cameras(folder: Path) -> None:
+    files = sorted(folder.rglob("*.json")) or sorted(folder.rglob("cameras.*"))
+    path = next((file for file in files if file.name == "transforms.json"), files[0])
+    # The cameras of Polycam and COLMAP are in several files of a folder.
+    if path.suffix != ".json" or len(files) == 3:
+        path = path.parent
+    is_path_file(path)
+    cameras = read_camera_set(path)
+    camera_source_files(path)
+    around = cameras.around_photo("b.jpg")
+    around.views()
+    try:
+        around.path()
+    except PathError as error:
+        _say(str(error))
+
+
 def _read_tree(name: str, folder: Path) -> None:
     find_dataset(name).described(folder)
     case = read_cases(name, folder)[0]
@@ -141,6 +170,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "depth": lambda folder: load_depth(_only(folder)),
     "portraits": lambda folder: load_photo_depth(_only(folder)),
     "ply": _read_ply,
+    "foreign_scenes": _read_foreign_scene,
+    "foreign_cameras": _read_foreign_cameras,
     "scenes": lambda folder: load_scene(_only(folder)),
     "cameras": lambda folder: load_cameras(_only(folder)),
     "keyframes": lambda folder: load_path(_only(folder)),
