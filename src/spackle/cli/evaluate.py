@@ -46,7 +46,7 @@ def evaluate(
             metavar="A,B,…",
             help=f"Methods, with commas: {METHODS}, or package.module:Class.",
         ),
-    ] = "base,paper,spackle",
+    ] = "base,paper-initial,paper,spackle",
     disparity: DisparitiesOption = "0.3,0.4,0.5",
     side: SideOption = None,
     second_views: Annotated[

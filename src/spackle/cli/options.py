@@ -27,8 +27,8 @@ PrecisionName = Literal["auto", "fp32", "bf16"]
 DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 DATASET_BASES = "sharp, moge, lite, hf:NAME, package.module:Class, or rgbd with depth maps"
 INPAINTERS = "exemplar, lama, opencv, propainter"
-DATASETS = "middlebury, booster, wildrgbd, tanks, eth3d, llff, or pairs (your own photos)"
-METHODS = "base, paper, spackle, spackle-scene, initial, dense, inpaint2d, direct-ft"
+DATASETS = "middlebury, booster, wildrgbd, tanks, eth3d, llff, pairs (your own), or photos alone"
+METHODS = "base, paper-initial, paper, spackle, spackle-scene, initial, dense, inpaint2d, direct-ft"
 METRICS = "clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips"
 WEIGHTS = "depth (MoGe-2), sharp, lama or features"
 

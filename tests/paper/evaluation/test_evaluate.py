@@ -33,6 +33,7 @@ from spackle.paper.evaluation.protocols import large_views, measure_views
 from spackle.paper.evaluation.published_metrics import PUBLISHED_METRICS, open_published_metrics
 from spackle.paper.evaluation.table import Table, mark_best, to_latex, to_markdown
 from spackle.paper.evaluation.tables import make_tables
+from spackle.pipeline import FillOptions
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 from spackle.runtime.errors import InputError
@@ -138,12 +139,14 @@ def cells(table: Table, dataset: str) -> list[Sequence[str]]:
 def test_large_view_tables_have_the_papers_layout_and_numbers() -> None:
     quality, holes, _, gaussians = make_tables([results("Middlebury", False, lambda image: LARGE)])
     base, spackle, sharp, _ = cells(quality, "Middlebury")
-    assert [name for name, _ in quality.heads[3::3]] == [
-        f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3)
+    # CLIPIQA was not measured: its columns are left out, and a note says how to get them.
+    assert quality.heads[3:] == [
+        (f"S{k}: disparity 0.{k + 2}", title) for k in (1, 2, 3) for title in ("NIQE ↓", "MUSIQ ↑")
     ]
-    assert tuple(base[:5]) == ("rgbd alone", "2/23", "", "4.5000", "(4 NaN)")
-    assert tuple(spackle[:4]) == ("Spackle‡ (rgbd)", "2/23", "", "**4.2500**")
-    assert tuple(sharp[:5]) == ("SHARP (paper)", "23", "0.3904", "4.3102", "58.2782")
+    assert "CLIPIQA not run: pyiqa is not installed." in quality.notes
+    assert tuple(base[:4]) == ("rgbd alone", "2/23", "4.5000", "(4 NaN)")
+    assert tuple(spackle[:3]) == ("Spackle‡ (rgbd)", "2/23", "**4.2500**")
+    assert tuple(sharp[:4]) == ("SHARP (paper)", "23", "4.3102", "58.2782")
     ours, theirs = cells(holes, "Middlebury")
     assert tuple(ours[2:5]) == ("0.2000", "0.0500", "75.00%")
     assert tuple(theirs[:5]) == ("Spackle on SHARP (paper)", "23", "0.0121", "0.0011", "90.47%")
@@ -153,21 +156,27 @@ def test_large_view_tables_have_the_papers_layout_and_numbers() -> None:
         ("3,387", "0.29", "1,183,035"),
     )
     assert any(note.startswith("‡ Not the paper's recipe") for note in quality.notes)
-    assert tuple(cells(quality, "Tanks")[0]) == ("not run", *[""] * 10)
+    assert tuple(cells(quality, "Tanks")[0]) == ("not run", *[""] * 7)
+    # A table may be copied without its notes.
+    assert quality.caption.endswith("Base of our rows: rgbd (Middlebury).")
     assert any("1 of 3 images could not be measured: gone." in note for note in quality.notes)
 
 
 def test_the_near_view_tables_have_the_papers_layout_and_numbers() -> None:
     figures: Figures = {
-        "dense": {"aux": 200, "dists": 0.25},
-        "paper": {"aux": 50, "dists": 0.125, "hole_cells": 51},
+        "dense": {"aux": 200, "psnr": 21.0, "dists": 0.25},
+        "paper": {"aux": 50, "psnr": 22.0, "dists": 0.125, "hole_cells": 51},
     }
     near, ablation, _ = make_tables([results("Booster", True, lambda image: figures)])
-    assert [tuple(row[:5]) for row in near.bodies[0]] == [
-        ("dense grid‡ (rgbd)", "", "", "0.2500", ""),
-        ("Spackle, eqs. 2 to 9‡ (rgbd)", "", "", "0.1250", ""),
+    # Ours stand in front of the published metrics; LPIPS and the distance were not measured.
+    assert near.heads[1:3] == [("Booster", "PSNR ↑"), ("Booster", "DISTS ↓")]
+    assert [tuple(row[:3]) for row in near.bodies[0]] == [
+        ("dense grid‡ (rgbd)", "21.00", "0.2500"),
+        ("Spackle, eqs. 2 to 9‡ (rgbd)", "22.00", "0.1250"),
     ]
-    assert [row[-1] for row in near.bodies[1]] == ["0.7154", "0.7325", "0.7180"]
+    assert [row[-1] for row in near.bodies[1]] == ["0.4837", "0.6042", "0.4589"]
+    (missing,) = [note for note in near.notes if "LPIPS not run" in note or "LPIPS" in note[:20]]
+    assert "distance" in missing
     assert near.notes[0].startswith("Views: all other photos")
     dense, guided, *papers = cells(ablation, "Booster")
     assert tuple(dense) == (
@@ -176,8 +185,8 @@ def test_the_near_view_tables_have_the_papers_layout_and_numbers() -> None:
         "50,000",
         "200.00",
         "",
+        "21.00",
         "0.2500",
-        "",
         "",
     )
     assert tuple(guided) == (
@@ -186,8 +195,8 @@ def test_the_near_view_tables_have_the_papers_layout_and_numbers() -> None:
         "50,000",
         "50.00",
         "75.00%",
+        "22.00",
         "0.1250",
-        "",
         "0.980",
     )
     expected = (
@@ -196,8 +205,8 @@ def test_the_near_view_tables_have_the_papers_layout_and_numbers() -> None:
         "1,179,648",
         "144.17",
         "99.97%",
+        "",
         "0.0871",
-        "0.3075",
         "",
     )
     assert tuple(papers[1]) == expected
@@ -265,6 +274,25 @@ def test_each_method_starts_from_the_same_base() -> None:
     for camera, before in zip(cameras, renderings, strict=True):
         difference = (fill(camera, before).rgb - before.rgb).abs()
         assert float(difference.max()) <= 1e-3  # the same viewpoint, in another unit of length
+
+
+def test_the_initial_gaussians_alone_are_the_papers_pass_without_a_network() -> None:
+    prediction = box_before_wall().lift()
+    renderer = get_renderer()
+    network = FillOptions().load_network()
+    context = FillContext(prediction.gaussians, prediction.camera, renderer, network=network)
+    camera = shifted(prediction.camera, 0.4)
+    before = renderer.render(context.base, camera)
+    initial, paper = (
+        make_method(name, [camera], context)(camera, before) for name in ("paper-initial", "paper")
+    )
+    untrained = make_method("paper", [camera], context.without_network)(camera, before)
+    assert torch.equal(initial.rgb, untrained.rgb)
+    assert len(initial.aux or ()) == len(paper.aux or ()) > 0
+    assert not torch.equal(initial.rgb, paper.rgb)
+    # Without a network the result depends on no weights, so it has no mark and no residual.
+    one = results("Booster", True, lambda image: {"paper-initial": {"psnr": 20.0}})
+    assert make_tables([one])[0].bodies[0][0][0] == "Initial Gaussians, eqs. 2 to 9 (rgbd)"
 
 
 def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 
 import pytest
-from helpers.command import run
+from helpers.command import refuses, run
 from helpers.evaluation_data import results, write_boxes
+from helpers.photos import write_photo
 from helpers.sharp_weights import MICRO_SIZE, write_tiny
 
 from spackle.paper.evaluation.folder import load_run
@@ -63,5 +65,49 @@ def test_a_stand_in_is_named_so_in_every_file(tmp_path: Path) -> None:
     assert [line for text in texts.values() for line in plain_sharp(text)] == []
     assert all("SHARP stand-in" in text for text in texts.values())
     tables = "".join(map(to_markdown, make_tables([load_run(out)])))
-    assert "SHARP stand-in alone" in tables
+    assert "direct FT (SHARP stand-in)" in tables
+    assert "Base of our rows: SHARP stand-in (Middlebury)." in tables
     assert "Spackle on SHARP (paper)" in tables
+
+
+def test_scenes_in_a_datasets_layout_keep_their_own_name(tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    write_boxes(root / "Ball", 0)
+    about = {"title": "Boxes", "about": "drawn boxes in Middlebury's layout, not Middlebury's"}
+    (root / "Ball" / "about.json").write_text(json.dumps(about))
+    words = ("--dataset", "middlebury", "--base", "rgbd", "--metrics", "none")
+    choices = ("--methods", "base,paper-initial", "--disparity", "0.6")
+    out = tmp_path / "out"
+    done = run("evaluate", root, *words, *choices, "-o", out)
+    assert done.code == 0, done.err
+    (table,) = [one for one in make_tables([load_run(out)]) if "disocclusion" in one.label]
+    rows = {texts[0] for rows in table.bodies for texts in rows if texts[0]}
+    assert "Boxes" in rows
+    assert f"Boxes: {about['about']}." in table.notes
+    (ours,) = [rows for rows in table.bodies if rows[0][0] == "Boxes"]
+    assert [texts[1] for texts in ours] == ["Initial Gaussians, eqs. 2 to 9 (rgbd)"]
+    # The counts are those of scenes, not of Middlebury's 23.
+    assert ours[0][2] == "1"
+    assert "Boxes" in (out / "tables.tex").read_text()
+
+    # A name of the paper's, and scenes of different names, are refused.
+    again = ("evaluate", root, *words, *choices, "-o", tmp_path / "none")
+    (root / "Ball" / "about.json").write_text(json.dumps(about | {"title": "Tanks"}))
+    refuses(run(*again), "about.json", "Tanks is a dataset of the paper")
+    write_boxes(root / "Chair", 1)
+    (root / "Ball" / "about.json").write_text(json.dumps(about))
+    refuses(run(*again), "Chair", "evaluate each by itself")
+
+
+def test_photos_need_nothing_but_the_photo(tmp_path: Path) -> None:
+    root = tmp_path / "holiday"
+    write_photo(root / "beach.JPG", 64, 48)
+    words = ("evaluate", root, "--dataset", "photos", "--metrics", "none", "--disparity", "0.6")
+    out = tmp_path / "out"
+    done = run(*words, "--base", "lite", "--methods", "base,paper-initial", "-o", out)
+    assert done.code == 0, done.err
+    found = load_run(out)
+    assert (found.title, found.measured_images) == ("Photos", ["holiday/beach"])
+    done = run(*words, "--base", "rgbd", "-o", tmp_path / "none")
+    assert done.code == 2
+    assert "neither a depth map nor points" in done.err

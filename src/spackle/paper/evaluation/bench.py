@@ -59,6 +59,7 @@ CONFIG_KEYS_OF_EVALUATION = (
     "dataset",
     "title",
     "terms",
+    "about_scenes",  # only of scenes that somebody made in a dataset's layout
     "images",
     "side",
     "disparities",
@@ -152,7 +153,11 @@ def _configuration(options: BenchOptions, evaluation: Evaluation) -> dict[str, A
     base_device = device.type if options.base.uses_network else "cpu"
 
     config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(TIMED_METHODS)}
-    config |= {name: evaluation.config[name] for name in CONFIG_KEYS_OF_EVALUATION}
+    config |= {
+        name: evaluation.config[name]
+        for name in CONFIG_KEYS_OF_EVALUATION
+        if name in evaluation.config
+    }
     config |= {
         "base": evaluation.config["base"] | {"device": base_device},
         "runs": options.runs,

@@ -13,7 +13,8 @@ from spackle.bases.open import OpenedBase, open_base, wrap_loaded_base
 from spackle.bases.settings import describe_base
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
 from spackle.paper.evaluation.case import Case, LoadedCase, SecondView, known_depth
-from spackle.paper.evaluation.datasets import find_dataset, read_cases
+from spackle.paper.evaluation.datasets import find_dataset, find_scenes, read_cases
+from spackle.paper.evaluation.datasets.labels import read_label
 from spackle.paper.evaluation.datasets.multiview import evenly_spaced_items
 from spackle.paper.evaluation.metric_suite import MetricSuite
 from spackle.paper.evaluation.metrics import DEFAULT_METRICS, METRICS
@@ -191,6 +192,7 @@ def _configuration(
         renderer: its device is recorded.
     """
     dataset = find_dataset(options.dataset).described(options.root)
+    label = read_label(dataset, list(find_scenes(options.dataset, options.root).values()))
     names_digest = json_digest([case.name for case in cases])
 
     # Weights are recorded by digest, because paths differ between machines.
@@ -202,8 +204,8 @@ def _configuration(
         "kind": "evaluate",
         "spackle": spackle.__version__,
         "dataset": options.dataset,
-        "title": dataset.title,
-        "terms": dataset.terms,  # of use of the photos
+        "title": label.title,
+        "terms": label.terms,  # of use of the photos
         "images": {"count": len(cases), "limit": options.limit, "names": names_digest},
         "protocol": options.protocol,
         "side": options.max_side,  # the long side of views, in pixels
@@ -215,6 +217,8 @@ def _configuration(
         "residual": _residual_configuration(options, renderer),
         "direct_ft": direct_ft,
     }
+    if label.about:
+        config["about_scenes"] = label.about
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.weight_files.items()}
         config["inpainter"] = {

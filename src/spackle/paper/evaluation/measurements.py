@@ -103,6 +103,11 @@ class Run:
         return str(self.config["title"])
 
     @property
+    def about_scenes(self) -> str:
+        """Half a sentence about scenes that only have the layout of a dataset; else ""."""
+        return str(self.config.get("about_scenes", ""))
+
+    @property
     def base_title(self) -> str:
         """The name of the base in tables, such as "SHARP"; see `title_of_base`.
 

@@ -27,9 +27,21 @@ METHODS = {
         color="#5b6066",
         marker="o",
     ),
+    "paper-initial": MethodDescription(
+        title="Initial Gaussians, eqs. 2 to 9",
+        summary=(
+            "our initial Gaussians alone, in the paper's pass without a network; the paper does "
+            "not say what its network starts from"
+        ),
+        color="#4dae86",
+        marker=">",
+    ),
     "paper": MethodDescription(
         title="Spackle, eqs. 2 to 9",
-        summary="the paper's method: one pass for each view, an aux Gaussian for each masked cell",
+        summary=(
+            "the paper's method: one pass for each view, an aux Gaussian for each masked cell, "
+            "which the network makes from our initial Gaussian"
+        ),
         color="#7a4fb5",
         marker="<",
         uses_residual=True,
@@ -51,8 +63,8 @@ METHODS = {
         uses_residual=True,
     ),
     "initial": MethodDescription(
-        title="initial Gaussians",
-        summary="as Spackle, without a network: deltas of zero",
+        title="Initial Gaussians, two passes",
+        summary="as Spackle, without network and texture",
         color="#008a66",
         marker="^",
     ),

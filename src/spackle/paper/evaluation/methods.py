@@ -57,6 +57,8 @@ def make_method(
         return _on_top_of_base(context, lambda camera, base_rendering: Gaussians.empty())
     if name == "paper":
         return _on_top_of_base(context, context.complete_as_paper)
+    if name == "paper-initial":
+        return _on_top_of_base(context, context.without_network.complete_as_paper)
     if name == "dense":
         return _on_top_of_base(context, partial(_dense_aux, context, context.photo_guard()))
     if name == "spackle-scene":

@@ -29,6 +29,7 @@ SecondViews = Literal["all", "nearest"]
 LARGE_VIEW_SIDE_PX = 1280
 
 PAPER_BASE = BaseSettings(name="sharp")
+DEFAULT_METHODS = ("base", "paper-initial", "paper", "spackle")
 TIMED_METHODS = ("paper", "spackle")  # the methods that `spackle bench` times
 
 
@@ -47,7 +48,7 @@ class EvaluateOptions:
     protocol: Protocol = "large-view"
     # Keys of `METHODS`, or `package.module:Name` for a function of (cameras, context) that returns
     # a function like those in methods.py.
-    methods: Sequence[str] = ("base", "paper", "spackle")
+    methods: Sequence[str] = DEFAULT_METHODS
     disparities: Sequence[float] = PAPER_DISPARITIES  # sizes of the camera moves of large views
     metrics: Sequence[str] | None = None  # keys of `METRICS`; None: all of the protocol
     base: BaseSettings = PAPER_BASE  # precision and device also apply to the residual network

@@ -25,7 +25,8 @@ class Table:
     label: str  # the label in the paper's source, if the paper has the table
     title: str
     caption: str
-    # For each column the head of its group ("" without a group), and its own head.
+    # For each column the head of its group ("" without a group), and its own head. Empty: no column
+    # could be measured, and the notes say why.
     heads: Sequence[tuple[str, str]]
     # Groups of rows, with a rule between groups.
     bodies: Sequence[Sequence[RowTexts]]
@@ -102,19 +103,23 @@ def group_widths(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
 
 def to_markdown(table: Table) -> str:
     """A table in Markdown, with title, caption and notes."""
+    notes = [f"- {note}" for note in table.notes]
+    intro = f"**{table.title}** (`{table.label}`). {table.caption}"
+    if not table.heads:
+        return "\n".join([intro, "", "No column could be measured:", "", *notes]) + "\n"
+
     # Markdown tables have one line of heads, so a group's head is repeated in each of its columns.
     heads = [f"{group}: {head}" if group else head for group, head in table.heads]
     lines = [
-        f"**{table.title}** (`{table.label}`). {table.caption}",
+        intro,
         "",
         _markdown_row(heads),
         "|" + "---|" * len(heads),
     ]
     lines += [_markdown_row(texts) for rows in table.bodies for texts in rows]
 
-    if table.notes:
-        lines.append("")
-        lines += [f"- {note}" for note in table.notes]
+    if notes:
+        lines += ["", *notes]
     return "\n".join(lines) + "\n"
 
 
@@ -181,6 +186,11 @@ def to_latex(table: Table, label_suffix: str = "") -> str:
         table: the table.
         label_suffix: the end of its label, which lets a document include several files of tables.
     """
+    # A comment, because LaTeX has no table without columns.
+    if not table.heads:
+        reasons = [escape_latex(note) for note in table.notes]
+        return "".join(f"% {line}\n" for line in (f"{table.label}: no column", *reasons))
+
     # One letter for each column: words are left-aligned, numbers centred.
     number_columns = len(table.heads) - table.word_columns
     shape = "l" * table.word_columns + "c" * number_columns

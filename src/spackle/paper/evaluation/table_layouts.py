@@ -109,9 +109,15 @@ NEAR_VIEW_QUALITY = TableLayout(
     title="Distance from true second photos",
     caption=(
         "The base, the naive decoupled framework (direct FT) and Spackle against true second "
-        "photos. Lower is better."
+        "photos."
     ),
-    columns=(ColumnLayout("DISTS", "dists"), ColumnLayout("LPIPS", "lpips")),
+    columns=(
+        ColumnLayout("distance ↓", "distance"),
+        ColumnLayout("PSNR ↑", "psnr"),
+        ColumnLayout("PSNR in the hole ↑", "psnr_hole"),
+        ColumnLayout("DISTS ↓", "dists"),
+        ColumnLayout("LPIPS ↓", "lpips"),
+    ),
     word_columns=1,
     notes=(LICENCE_NOTE,),
 )
@@ -128,11 +134,18 @@ DENSE_AGAINST_MASKED = TableLayout(
         ColumnLayout("Base GS", "base_gaussians", "count"),
         ColumnLayout("Aux. GS ↓", "aux", "hundredths"),
         ColumnLayout("Reduction ↑", "aux_reduction", "percent"),
+        ColumnLayout("distance ↓", "distance"),
+        ColumnLayout("PSNR ↑", "psnr"),
         ColumnLayout("DISTS ↓", "dists"),
         ColumnLayout("LPIPS ↓", "lpips"),
         ColumnLayout("Aux. GS / (HAR × grid)", "aux_per_cell", "rate"),
     ),
-    row_titles={"dense": "Dense grid init", "paper": "Mask guided init", "spackle": "Spackle"},
+    row_titles={
+        "dense": "Dense grid init",
+        "paper": "Mask guided init",
+        "paper-initial": "",
+        "spackle": "Spackle",
+    },
     notes=(PAPER_IMAGES_NOTE, LICENCE_NOTE),
 )
 
@@ -173,13 +186,13 @@ NEAR_VIEW_HOLES = TableLayout(
     ),
     columns=(
         ColumnLayout("base HAR", "har_before", "ratio"),
+        ColumnLayout("in the hole", "distance", group="distance ↓"),
         ColumnLayout("image", "psnr", group="PSNR ↑"),
         ColumnLayout("in the hole", "psnr_hole", group="PSNR ↑"),
         ColumnLayout("outside", "psnr_outside", group="PSNR ↑"),
         ColumnLayout("image", "ssim", group="SSIM ↑"),
         ColumnLayout("in the hole", "ssim_hole", group="SSIM ↑"),
         ColumnLayout("outside", "ssim_outside", group="SSIM ↑"),
-        ColumnLayout("in the hole", "distance", group="distance ↓"),
     ),
     marks_best=True,
     notes=(PAPER_IMAGES_NOTE, BEST_NOTE),

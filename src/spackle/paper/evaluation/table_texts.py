@@ -13,7 +13,7 @@ from spackle.paper.evaluation.method_descriptions import describe_method
 from spackle.paper.evaluation.metrics import METRICS, metric_of_column
 from spackle.paper.evaluation.paper_numbers import PAPER_PARAMETERS
 from spackle.paper.evaluation.table import NOT_RUN
-from spackle.paper.evaluation.table_layouts import TableLayout
+from spackle.paper.evaluation.table_layouts import ColumnLayout, TableLayout
 
 # Marks methods whose residual network was not trained by the paper's recipe.
 RECIPE_MARK = "‡"
@@ -73,17 +73,51 @@ def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
     return {method: method_row_name(run, method) for method in methods}
 
 
+def missing_columns(layout: TableLayout, runs: Sequence[Run]) -> list[ColumnLayout]:
+    """The columns of image metrics that none of a table's runs has measured; they are left out.
+
+    A table that shows no run has all columns, for the paper's numbers.
+    """
+    if not runs:
+        return []
+    measured = {measurement.metric for run in runs for measurement in run.measurements}
+    return [
+        column
+        for column in layout.columns
+        if metric_of_column(column.metric) is not None and column.metric not in measured
+    ]
+
+
+def caption_of_table(layout: TableLayout, runs: Sequence[Run]) -> str:
+    """A table's caption, which also says on which base and which scenes its numbers are from.
+
+    A table may be copied without its notes.
+    """
+    titles_by_base: dict[str, list[str]] = {}
+    for run in runs:
+        titles = titles_by_base.setdefault(run.base_title, [])
+        if run.title not in titles:
+            titles.append(run.title)
+    if not titles_by_base:
+        return layout.caption
+    bases = [f"{base} ({', '.join(titles)})" for base, titles in titles_by_base.items()]
+    return f"{layout.caption} Base of our rows: {'; '.join(bases)}."
+
+
 def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
     """The notes below a table that shows these runs; a note that runs share is listed once."""
     # Several columns may show one metric, such as PSNR in the hole and outside.
     metrics = [metric_of_column(column.metric) for column in layout.columns]
     image_metrics = list(dict.fromkeys(metric for metric in metrics if metric is not None))
+    left_out = {metric_of_column(column.metric) for column in missing_columns(layout, runs)}
+    shown_metrics = [metric for metric in image_metrics if metric not in left_out]
 
-    notes = [_views_note(run) for run in runs]
+    notes = [f"{run.title}: {run.about_scenes}." for run in runs if run.about_scenes]
+    notes += [_views_note(run) for run in runs]
     notes += [f"Base {run.base_title}: {run.base_description}." for run in runs]
     notes += _methods_notes(layout, runs)
     notes += [_residual_note(run) for run in runs]
-    notes += [f"{METRICS[name].name}: {METRICS[name].definition}." for name in image_metrics]
+    notes += [f"{METRICS[name].name}: {METRICS[name].definition}." for name in shown_metrics]
     for run in runs:
         notes += _missing_metrics_notes(run, image_metrics)
         notes += _missing_images_notes(run)
@@ -149,7 +183,7 @@ def _missing_metrics_notes(run: Run, image_metrics: Sequence[str]) -> list[str]:
     states = run.about.get("metrics", {})  # by metric, such as "not run: NIQE needs pyiqa"
     names_by_reason: dict[str, list[str]] = {}
     for metric in image_metrics:
-        state = str(states.get(metric))
+        state = str(states.get(metric, f"{NOT_RUN}: not among the chosen `metrics`"))
         if state.startswith(NOT_RUN):
             names_by_reason.setdefault(state, []).append(METRICS[metric].name)
     return [f"{', '.join(names)} {reason}." for reason, names in names_by_reason.items()]

@@ -6,6 +6,7 @@ and writes notes, table.py writes the finished tables as Markdown and LaTeX.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -42,7 +43,12 @@ from spackle.paper.evaluation.table_numbers import (
     mean_of_metric,
     texts_of_methods,
 )
-from spackle.paper.evaluation.table_texts import notes_of_table, shown_methods
+from spackle.paper.evaluation.table_texts import (
+    caption_of_table,
+    missing_columns,
+    notes_of_table,
+    shown_methods,
+)
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 
@@ -95,21 +101,11 @@ def make_tables(runs: Sequence[Run], *, with_unmeasured: bool = False) -> list[T
         if not shown_runs and not (with_unmeasured and is_in_paper):
             continue
         settings = [NEAR_SETTING] if layout.source == "near" else large_settings
-
-        # Three tables of the paper have a layout of their own.
-        if layout is NEAR_VIEW_QUALITY:
-            content = _near_view_content(layout, shown_runs, settings)
-        elif layout is OVERHEAD:
-            content = _overhead_content(layout, shown_runs, settings)
-        elif layout is EXPANDED_OVERHEAD:
-            content = _expanded_overhead_content(layout, shown_runs, settings)
-        else:
-            content = _content_by_dataset(layout, shown_runs, settings)
-
+        content = _content_of_table(layout, shown_runs, settings)
         table = Table(
             label=layout.label,
             title=layout.title,
-            caption=layout.caption,
+            caption=caption_of_table(layout, shown_runs),
             heads=content.heads,
             bodies=content.bodies,
             word_columns=layout.word_columns,
@@ -117,6 +113,29 @@ def make_tables(runs: Sequence[Run], *, with_unmeasured: bool = False) -> list[T
         )
         tables.append(table)
     return tables
+
+
+def _content_of_table(
+    layout: TableLayout, runs: Sequence[Run], settings: Sequence[str]
+) -> TableContent:
+    """Heads and rows of a table, without the columns of metrics that no run has measured.
+
+    If there is no other column, the table has neither heads nor rows: its notes say why.
+    """
+    missing = missing_columns(layout, runs)
+    shown_columns = tuple(column for column in layout.columns if column not in missing)
+    if not shown_columns:
+        return TableContent(heads=[], bodies=[])
+    shown_layout = dataclasses.replace(layout, columns=shown_columns)
+
+    # Three tables of the paper have a layout of their own.
+    if layout is NEAR_VIEW_QUALITY:
+        return _near_view_content(shown_layout, runs, settings)
+    if layout is OVERHEAD:
+        return _overhead_content(shown_layout, runs, settings)
+    if layout is EXPANDED_OVERHEAD:
+        return _expanded_overhead_content(shown_layout, runs, settings)
+    return _content_by_dataset(shown_layout, runs, settings)
 
 
 def _check_distinct(runs: Sequence[Run]) -> None:
@@ -197,8 +216,14 @@ def write_tables(
 
 
 def _datasets(runs: Sequence[Run]) -> list[str]:
-    """The titles of the paper's datasets, and then those of other datasets among the runs."""
-    return list(dict.fromkeys([*PAPER_IMAGE_COUNTS, *(run.title for run in runs)]))
+    """The titles of the datasets among the runs, and then the paper's other datasets.
+
+    In both parts the paper's datasets come first, in the paper's order.
+    """
+    titles = {run.title for run in runs}
+    measured_of_paper = [title for title in PAPER_IMAGE_COUNTS if title in titles]
+    all_measured = [*measured_of_paper, *(run.title for run in runs)]
+    return list(dict.fromkeys([*all_measured, *PAPER_IMAGE_COUNTS]))
 
 
 def prepend_group_name(name: str, rows: Sequence[RowTexts]) -> list[RowTexts]:
@@ -305,7 +330,6 @@ def _near_view_content(
     datasets = _datasets(runs)
     # A column has two heads: one that it shares with its neighbours ("" if none), and its own.
     heads = [("", "Method")]
-    heads += [(dataset, column.title) for dataset in datasets for column in columns]
 
     # By the row's name, then by dataset: the texts of the row in the dataset's columns.
     measured_rows: dict[str, dict[str, list[str]]] = {}
@@ -320,6 +344,11 @@ def _near_view_content(
     if not measured_rows:
         measured_rows[NOT_RUN] = {}
 
+    # Datasets without any number would only widen the table.
+    all_rows = [*measured_rows.values(), *paper_rows.values()]
+    datasets = [name for name in datasets if any(any(row.get(name, ())) for row in all_rows)]
+    heads += [(dataset, column.title) for dataset in datasets for column in columns]
+
     no_numbers = [NO_NUMBER] * len(columns)
     bodies: list[list[RowTexts]] = []
     for rows in (measured_rows, paper_rows):
@@ -328,7 +357,9 @@ def _near_view_content(
             row_texts = [name]
             for dataset in datasets:
                 row_texts += texts_by_dataset.get(dataset, no_numbers)
-            body.append(row_texts)
+            # The paper has no numbers for metrics of ours.
+            if any(row_texts[1:]) or name == NOT_RUN:
+                body.append(row_texts)
         bodies.append(body)
     return TableContent(heads, bodies)
 

@@ -19,12 +19,13 @@ from spackle.paper.evaluation.datasets.eth3d import ETH3D
 from spackle.paper.evaluation.datasets.llff import LLFF
 from spackle.paper.evaluation.datasets.middlebury import MIDDLEBURY
 from spackle.paper.evaluation.datasets.pairs import PAIRS
+from spackle.paper.evaluation.datasets.photos import PHOTOS
 from spackle.paper.evaluation.datasets.tanks import TANKS
 from spackle.paper.evaluation.datasets.wildrgbd import WILDRGBD
 from spackle.runtime.errors import InputError
 from spackle.runtime.plugins import check_name_or_plugin, is_plugin, load_plugin
 
-__all__ = ["DATASETS", "EvalDataset", "find_dataset", "read_cases"]
+__all__ = ["DATASETS", "EvalDataset", "find_dataset", "find_scenes", "read_cases"]
 
 # The paper's six datasets, in the order of its tables, and the user's own photos. A further dataset
 # is a further line here.
@@ -36,6 +37,7 @@ _ALL_DATASETS = (
     ETH3D,
     LLFF,
     PAIRS,
+    PHOTOS,
 )
 DATASETS: dict[str, EvalDataset] = {dataset.name: dataset for dataset in _ALL_DATASETS}
 
@@ -75,6 +77,25 @@ def read_cases(name: str, root: Path) -> list[Case]:
         InputError: there is no such folder, no scene (the message names the expected files) or no
             photo; two scenes have the same name; or a scene's files are missing or damaged.
     """
+    cases = find_dataset(name).read_cases(find_scenes(name, root))
+    if not cases:
+        raise InputError(
+            f"{root}: the scenes of {name} have no photos with a pose: unpack the dataset again"
+        )
+    return cases
+
+
+def find_scenes(name: str, root: Path) -> dict[str, Path]:
+    """The folders of a dataset's scenes, by the scene's name, in an order that depends on names.
+
+    Args:
+        name: of the dataset, see `find_dataset`.
+        root: the folder of the unpacked dataset, or a folder of it.
+
+    Raises:
+        InputError: there is no such folder or no scene (the message names the expected files), or
+            two scenes have the same name.
+    """
     dataset = find_dataset(name)
     if not root.is_dir():
         raise InputError(f"{root}: no such folder: give the folder of the unpacked dataset {name}")
@@ -100,13 +121,7 @@ def read_cases(name: str, root: Path) -> list[Case]:
                 "or part"
             )
         scenes[scene] = folder
-
-    cases = dataset.read_cases(scenes)
-    if not cases:
-        raise InputError(
-            f"{root}: the scenes of {name} have no photos with a pose: unpack the dataset again"
-        )
-    return cases
+    return scenes
 
 
 def _scene_folders(
@@ -119,7 +134,7 @@ def _scene_folders(
         dataset: says what a scene's folder holds, and which folders are not searched.
         depth: how many levels of folders below `folder` are searched.
     """
-    if any((folder / marker).exists() for marker in dataset.markers):
+    if any(True for marker in dataset.markers for _ in folder.glob(marker)):
         yield folder
         return
     if depth == 0:

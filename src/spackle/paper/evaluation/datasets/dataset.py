@@ -35,7 +35,8 @@ class EvalDataset:
     terms: str  # terms of use, in a few words
     # Reads title and terms from the root folder, if it is the user who gives them; else None.
     describe: Callable[[Path], DatasetDescription] | None = None
-    # A folder is a scene if it holds one of these files or folders.
+    # A folder is a scene if it holds one of these files or folders, or a match of a pattern such as
+    # "*.jpg".
     markers: Sequence[str]
     expected: str  # the files of a scene, for messages
     # From scene names to scene folders, both sorted, to cases; InputError for bad files.
