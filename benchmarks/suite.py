@@ -227,13 +227,13 @@ def video_section(
     prediction, aux = lift(), Gaussians.empty()
     depths = DepthRange.of(prediction.gaussians)
     path = trajectory_cameras("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
-    context = FillContext(prediction.gaussians, prediction.camera, renderer, network)
+    context = FillContext.of(prediction, renderer, network)
 
     def scene(lap: EndStage) -> None:
         nonlocal aux
         base = lift()
         lap(LIFT)
-        aux = fill_scene(FillContext(base.gaussians, base.camera, renderer, network), path).aux
+        aux = fill_scene(FillContext.of(base, renderer, network), path).aux
         lap(COMPLETE)
         with torch.no_grad():  # frames as bytes, so that all fit into memory
             views = (renderer.render([base.gaussians, aux], camera).rgb for camera in path)

@@ -14,13 +14,15 @@ import spackle
 
 def main(file: Path, photo: Path, out: Path) -> None:
     gaussians = spackle.load_ply(file)
-    camera = spackle.load_photo(
-        photo
-    ).camera  # the focal length comes from EXIF; if EXIF has none, give fov=...
+    # The focal length comes from EXIF; if EXIF has none, give fov=...
+    loaded = spackle.load_photo(photo)
+    camera = loaded.camera
 
     before = spackle.Scene(gaussians, gaussians.select(slice(0)), camera)
     path = before.path("swipe", disparity=0.3)
-    prediction = spackle.BasePrediction(gaussians, camera, notes={})
+    # A network that looks at the photo needs it; without photo=... it would see the Gaussians,
+    # rendered from the photo's camera.
+    prediction = spackle.BasePrediction(gaussians, camera, notes={}, photo=loaded.rgb)
     scene = spackle.complete(prediction, path)
 
     holes = [spackle.hole_area_ratio(each.render(path[0]).alpha) for each in (before, scene)]

@@ -28,8 +28,8 @@ def mean_color(camera: spackle.Camera, before: spackle.Rendering) -> MethodView:
 
 def main() -> list[Measurement]:
     pair = load_motorcycle()
-    base = lift_rgbd(pair.left, pair.depth, pair.left_camera).gaussians
-    context = spackle.FillContext(base, pair.left_camera, spackle.get_renderer())
+    prediction = lift_rgbd(pair.left, pair.depth, pair.left_camera)
+    context = spackle.FillContext.of(prediction, spackle.get_renderer())
     views = [Viewpoint("near", "right", pair.right_camera, lambda: pair.right)]
     methods: dict[str, Callable[[Sequence[spackle.Camera]], Fill]] = {
         "mine": lambda cameras: mean_color

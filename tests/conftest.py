@@ -31,6 +31,7 @@ JOURNEYS = (
     "paper/evaluation/test_report_html.py",
     "paper/training/test_direct_ft.py",
     "paper/training/test_training.py",
+    "paper/training/test_whole_views.py",
     "render/test_kernels.py",
     "runtime/test_workers.py",
     "scene_fill/test_fill_scene.py",

@@ -319,11 +319,10 @@ class Pipeline:
         if texture == "none":
             return FilledHoles(aux=Gaussians.empty(prediction.gaussians.means.device))
 
-        context = FillContext(
-            base=prediction.gaussians,
-            photo_camera=prediction.camera,
-            renderer=self.renderer,
-            network=self.network,
+        context = FillContext.of(
+            prediction,
+            self.renderer,
+            self.network,
             texture=open_texture(texture),
             precision=self.options.base.precision,
         )
@@ -470,11 +469,10 @@ def complete(
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
     """
-    context = FillContext(
-        base=prediction.gaussians,
-        photo_camera=prediction.camera,
-        renderer=renderer or get_renderer(),
-        network=shipped_network() if network == "shipped" else network,
+    context = FillContext.of(
+        prediction,
+        renderer or get_renderer(),
+        shipped_network() if network == "shipped" else network,
         texture=open_texture(fill),
     )
     views_to_fill = cameras if fill != "none" else ()

@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 import torch
 from helpers import portraits
-from helpers.photos import HEIGHT, WIDTH, metres, write_depth, write_photo
-from helpers.scenes import same_bits
+from helpers.photos import HEIGHT, WIDTH, metres, picture, write_depth, write_photo
+from helpers.scenes import random_gaussians, same_bits
 from helpers.sharp_weights import gaussians_of, write_tiny
 from helpers.stand_in import SHARP_FILE, StandIn, write_model
 
 import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.lite import INPUT_SCALES, LiteBase
-from spackle.bases.open import BaseError, ResolvedBase, open_base
+from spackle.bases.open import BaseError, ResolvedBase, open_base, wrap_loaded_base
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.encoder import MICRO_SIZE
 from spackle.bases.transformers import HfBase
 from spackle.core.focal_length import FocalSource
-from spackle.core.photo import Photo, load_photo
+from spackle.core.photo import Photo, load_photo, photo_from_picture
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.readers import load_depth
 from spackle.runtime.errors import InputError
@@ -319,3 +319,37 @@ def test_a_base_of_another_package_is_named_by_its_module_and_class(
             pick(photo, name=name)
     with pytest.raises(InputError, match=r"`precision` fp32: the package\.module:Class base"):
         pick(photo, name="box_base:Box", precision="fp32")
+
+
+class ForeignBase:
+    """A base of another package, which returns a small scene without the photo."""
+
+    name = "foreign"
+
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        camera = photo.camera.resized(32, 24)
+        return BasePrediction(random_gaussians(5), camera, {})
+
+
+@pytest.mark.usefixtures("sharp")
+@pytest.mark.parametrize("name", ["lite", "sharp", "rgbd", "foreign"])
+def test_a_prediction_has_the_photo_at_its_cameras_size(
+    name: str, tmp_path: Path, photo: Path
+) -> None:
+    # SHARP alone is quick enough for a photo above the working size, 1536 pixels.
+    width, height = (1600, 800) if name == "sharp" else (WIDTH, HEIGHT)
+    loaded = photo_from_picture(picture(width, height))
+    if name == "foreign":
+        base = wrap_loaded_base(ForeignBase())
+    else:
+        depth = write_depth(tmp_path / "depth.npy") if name == "rgbd" else None
+        base = open_base(BaseSettings(name=name, depth=depth))
+    prediction, _ = base.predict(loaded)
+    camera = prediction.camera
+    assert prediction.photo is not None
+    assert prediction.photo.shape == (camera.height, camera.width, 3)
+    assert camera.width == {"sharp": 1536, "foreign": 32}.get(name, WIDTH)
+    if name in ("lite", "rgbd"):
+        assert torch.equal(prediction.photo, loaded.rgb)  # its border is not replaced
+    means = [rgb.mean((0, 1)) for rgb in (prediction.photo, loaded.rgb)]
+    assert float((means[0] - means[1]).abs().max()) < 0.01

@@ -54,7 +54,7 @@ def test_crops_give_the_deltas_of_the_whole_view() -> None:
         base, leftmost_and_rightmost(scene.camera, 0.1, DepthRange.of(base))[1], scene.camera
     )
     mask = view.mask
-    one = view.deltas(shipped(), "fp32", dense=True)
+    one = view.deltas(shipped(), "fp32", cells=torch.ones_like(view.mask))
     other = view.deltas(shipped(), "fp32")
     bf16 = view.deltas(shipped(), "bf16")
     assert one is not None

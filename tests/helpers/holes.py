@@ -48,8 +48,8 @@ def view_of(
 ) -> SceneViewCompletion:
     """The completion of a view of Gaussians, or of a rendering."""
     rendering = base if isinstance(base, Rendering) else CPU.render(base, camera)
-    render_photo = None if photo is None else lambda: photo
-    return SceneViewCompletion(rendering, camera, photo_camera, render_photo)
+    get_photo = None if photo is None else lambda: photo
+    return SceneViewCompletion(rendering, camera, photo_camera, get_photo)
 
 
 def random_network(seed: int = 0, size: float = 0.02, name: str = "unet") -> ResidualNet:

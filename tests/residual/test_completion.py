@@ -148,11 +148,11 @@ class CountedView(ViewCompletion):
     """Notes which inputs a network asks for."""
 
     def __init__(self, rendering: Rendering, camera: Camera, photo_camera: Camera) -> None:
-        super().__init__(rendering, camera, photo_camera, self.render_photo)
+        super().__init__(rendering, camera, photo_camera, self.get_photo)
         self.asked: list[str] = []
 
-    def render_photo(self) -> Tensor:
-        self.asked.append("the photo's rendering")
+    def get_photo(self) -> Tensor:
+        self.asked.append("the photo itself")
         return torch.rand(72, 96, 3, generator=torch.Generator().manual_seed(0))
 
     def input(self, name: str) -> Tensor:
@@ -169,7 +169,7 @@ def test_a_network_gets_only_the_inputs_that_it_names() -> None:
         assert view.network_input(names).shape == (1, channels, 36, 48)
         expected = list(names)
         if "photo" in names:
-            expected.insert(1, "the photo's rendering")
+            expected.insert(1, "the photo itself")
         assert view.asked == expected
         # Each part is computed when it is asked for.
         assert ("initial" in vars(view)) == (names != ("rgb", "mask"))

@@ -29,9 +29,10 @@ from spackle.core.trajectories import (
     leftmost_and_rightmost,
     trajectory_cameras,
 )
+from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
-from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask, initialize
+from spackle.residual import ViewFeatures, completion, hole_area_ratio, hole_mask, initialize
 from spackle.residual.initializer import inside_photo
 from spackle.scene_fill import FillContext, fill, fill_scene, fill_view
 from spackle.scene_fill.fill import GUARDED_VIEWS, farthest_first
@@ -260,3 +261,28 @@ def test_motorcycle_is_filled_and_visible_pixels_stay() -> None:
     for camera in leftmost_and_rightmost(found.camera, 0.3, DepthRange.of(context.base)):
         assert holes_of(camera, context.base) > 0.2
         assert holes_of(camera, context.base, whole) <= 0.03 * holes_of(camera, context.base)
+
+
+def test_a_network_that_names_the_photo_sees_the_photo_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[Any] = []
+    sample = completion.sample_photo
+
+    def noted(photo: Any, *others: Any) -> Any:
+        seen.append(photo)
+        return sample(photo, *others)
+
+    monkeypatch.setattr(completion, "sample_photo", noted)
+    # This "photo" differs from all that the Gaussians show.
+    photo = torch.rand(72, 96, 3, generator=torch.Generator().manual_seed(0))
+    prediction = dataclasses.replace(box_before_wall().lift(), photo=photo)
+    camera = shifted(prediction.camera, 0.4)
+    network = random_network(name="sharp-decoder")
+    complete(prediction, [camera], network=network, fill="network", renderer=CPU)
+    assert seen.pop() is photo
+    # Gaussians of another tool come without a photo: their rendering stands in.
+    nameless = dataclasses.replace(prediction, photo=None)
+    complete(nameless, [camera], network=network, fill="network", renderer=CPU)
+    assert psnr(seen.pop(), box_before_wall().rgb) > 30
+    assert not seen

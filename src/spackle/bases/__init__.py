@@ -11,6 +11,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Protocol
 
+from torch import Tensor
+
 from spackle.core.camera import Camera
 from spackle.core.focal_length import focal_mm_to_px
 from spackle.core.gaussians import Gaussians
@@ -37,6 +39,9 @@ class BasePrediction:
     lens_source: str = ""  # who gave the focal length, if neither the photo's file nor the user did
     max_disparity: float = DEFAULT_MAX_DISPARITY  # largest camera move with correct geometry
     max_hole_ratio: float = DEFAULT_MAX_HOLE_RATIO  # share of the widest views that may be holes
+    # [H, W, 3] sRGB: the photo at the camera's size, which residual networks see (I in eq. 5).
+    # None: unknown, as for Gaussians of another tool; a rendering of the Gaussians then stands in.
+    photo: Tensor | None = dataclasses.field(default=None, repr=False, compare=False)
 
 
 class Base(Protocol):

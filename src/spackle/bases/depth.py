@@ -88,7 +88,9 @@ def lift_predicted_depth(photo: Photo, depth: DepthMap, camera: Camera) -> BaseP
     First the photo's outermost pixels are replaced by the pixels just inside, because they often
     show a scan's edge or colours mixed by resizing.
     """
-    return lift_rgbd(replace_border(photo.rgb), depth, camera)
+    prediction = lift_rgbd(replace_border(photo.rgb), depth, camera)
+    # The Gaussians lack the border, but the photo itself is kept as it is.
+    return dataclasses.replace(prediction, photo=photo.rgb)
 
 
 def lift_rgbd(
@@ -100,4 +102,4 @@ def lift_rgbd(
     Gaussian; with `levels` = 0, each pixel has its own. InputError if no pixel has a depth.
     """
     lifted = lift_depth_map(rgb, depth, camera, levels)
-    return BasePrediction(lifted.gaussians, lifted.camera, lifted.notes)
+    return BasePrediction(lifted.gaussians, lifted.camera, lifted.notes, photo=rgb)

@@ -29,7 +29,7 @@ from spackle.bases.settings import (
 )
 from spackle.bases.sharp.base import SharpBase
 from spackle.bases.transformers import HfBase
-from spackle.core.photo import Photo
+from spackle.core.photo import Photo, resize_rgb
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.in_photo.layouts import load_photo_depth
 from spackle.depth.readers import find_depth_file, load_depth
@@ -401,4 +401,10 @@ def _predict_finite(base: Base, photo: Photo, progress: Progress) -> BasePredict
             f"{photo.path}: the base's Gaussians leave the range of float32: "
             "check depth and focal length"
         )
+
+    # A base of another package need not return the photo; the fill's network may want it.
+    if prediction.photo is None:
+        camera = prediction.camera
+        photo_rgb = resize_rgb(photo.rgb, camera.width, camera.height)
+        prediction = dataclasses.replace(prediction, photo=photo_rgb)
     return prediction

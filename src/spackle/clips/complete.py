@@ -98,7 +98,7 @@ class ClipCompleter:
         starts_shot = frame.previous is not self._previous
 
         if self.fill:
-            view, memory = self._fill(frame, prediction.camera, camera, base_rendering)
+            view, memory = self._fill(frame, prediction, camera, base_rendering)
         else:
             # Holes stay open, so that nothing has to be remembered for the next frame.
             memory = None
@@ -134,7 +134,7 @@ class ClipCompleter:
     def _fill(
         self,
         frame: _AlignedFrame,
-        photo_camera: Camera,
+        prediction: BasePrediction,
         camera: Camera,
         base_rendering: Rendering,
     ) -> tuple[CompletedView, FrameMemory]:
@@ -142,7 +142,7 @@ class ClipCompleter:
 
         Args:
             frame: the frame.
-            photo_camera: that took the frame.
+            prediction: of the frame; its Gaussians are not aligned with the previous frame's.
             camera: the view.
             base_rendering: the view of the frame's own Gaussians.
 
@@ -150,11 +150,10 @@ class ClipCompleter:
             The completed view, and what the next frame has to know of it.
         """
         # No texture is added, because each frame would find other patches for it, which flickers.
-        context = FillContext(
-            base=frame.base,
-            photo_camera=photo_camera,
-            renderer=self.renderer,
-            network=self.network,
+        context = FillContext.of(
+            dataclasses.replace(prediction, gaussians=frame.base),
+            self.renderer,
+            self.network,
             texture=None,
             precision=self.precision,
         )

@@ -237,24 +237,32 @@ def resize_photo(photo: Photo, max_side: int = MAX_WORKING_SIDE_PX) -> Photo:
     width, height = working_size(photo.width, photo.height, max_side)
     if (width, height) == (photo.width, photo.height):
         return photo
-    rgb = photo.rgb.new_empty(height, width, 3)
+    rgb = resize_rgb(photo.rgb, width, height)
+    frame = photo.frame
+    if frame is not None:
+        frame = frame.scaled(width / photo.width, height / photo.height)
+    focal_px = photo.focal_px * width / photo.width
+    return dataclasses.replace(photo, rgb=rgb, focal_px=focal_px, frame=frame)
+
+
+def resize_rgb(rgb: Tensor, width: int, height: int) -> Tensor:
+    """An image [H, W, 3] in 0..1 resized by Lanczos, [height, width, 3]; itself if it fits."""
+    if (height, width) == tuple(rgb.shape[:2]):
+        return rgb
+    resized = rgb.new_empty(height, width, 3)
 
     def resize_channel(channel: int, _: int) -> None:
         """Resize one colour channel; Pillow resizes floats only channel by channel.
 
         `_` is the end of the chunk of channels, which has only this one.
         """
-        full = Image.fromarray(photo.rgb[..., channel].contiguous().numpy())
-        resized = np.array(full.resize((width, height), Image.Resampling.LANCZOS))
+        image = Image.fromarray(rgb[..., channel].contiguous().numpy())
+        pixels = np.array(image.resize((width, height), Image.Resampling.LANCZOS))
         # Lanczos overshoots at edges, so values can leave the range of colours.
-        rgb[..., channel] = torch.from_numpy(resized).clamp_(0, 1)
+        resized[..., channel] = torch.from_numpy(pixels).clamp_(0, 1)
 
     parallel_for_chunks(resize_channel, 3, 1)  # three channels, each a chunk of its own
-    frame = photo.frame
-    if frame is not None:
-        frame = frame.scaled(width / photo.width, height / photo.height)
-    focal_px = photo.focal_px * width / photo.width
-    return dataclasses.replace(photo, rgb=rgb, focal_px=focal_px, frame=frame)
+    return resized
 
 
 def replace_border(rgb: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -24,6 +24,9 @@ from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.runtime.device import Precision
 
 MIN_AUX_GAUSSIANS = 64  # least number of aux Gaussians in a view (paper, "Training Details")
+# Which cells of a view (2×2 pixels) get an aux Gaussian: "masked" are those in holes, the paper's
+# method; "all" is the dense grid of the paper's table of mask-guided initialisation.
+CellChoice = Literal["masked", "all"]
 MIN_RELATIVE_DEPTH = 1e-4  # smaller inverse depths, as fractions of the view's median, are raised
 
 
@@ -58,7 +61,7 @@ class ViewCompletion:
         rendering: Rendering,
         camera: Camera,
         photo_camera: Camera,
-        render_photo: Callable[[], Tensor] | None = None,
+        get_photo: Callable[[], Tensor] | None = None,
         threshold: float = MASK_THRESHOLD,
     ) -> None:
         """Keep the view; nothing is computed yet.
@@ -67,15 +70,15 @@ class ViewCompletion:
             rendering: the base's Gaussians rendered from the view, on any device (eqs. 2 and 3).
             camera: of the view.
             photo_camera: of the photo from which the base was predicted.
-            render_photo: returns the photo [H', W', 3], sRGB; called only for a network that names
-                "photo".
+            get_photo: returns the photo I of eq. 5, [H', W', 3] sRGB, of the size of its camera;
+                called only for a network that names "photo".
             threshold: τ_α of eq. 4: a pixel with a lower opacity is a hole.
         """
         self.rendering = rendering
         self.camera = camera
         self.photo_camera = photo_camera
         self.threshold = threshold
-        self._render_photo = render_photo
+        self._get_photo = get_photo
 
     @functools.cached_property
     def features(self) -> ViewFeatures:
@@ -106,6 +109,16 @@ class ViewCompletion:
         cells.view(-1)[by_opacity[:at_least]] = True
         return cells
 
+    def chosen_cells(self, choice: CellChoice) -> Tensor:
+        """[h, w] bool: the cells of 2×2 pixels that get an aux Gaussian.
+
+        Training and evaluation ask here. "masked": the cells in holes, and at least 64 ("Training
+        Details"); "all": every cell.
+        """
+        if choice == "all":
+            return torch.ones_like(self.mask)
+        return self.cells(at_least=MIN_AUX_GAUSSIANS)
+
     @functools.cached_property
     def initial(self) -> InitialGaussians:
         """The initial Gaussians of all cells."""
@@ -118,10 +131,10 @@ class ViewCompletion:
         The initial Gaussian is the first guess of what fills the cell. If it lies outside of what
         the photo shows, its own colour is taken.
         """
-        if self._render_photo is None:
+        if self._get_photo is None:
             raise ValueError('a network names the input "photo", but no photo was given')
         return sample_photo(
-            self._render_photo(),
+            self._get_photo(),
             self.initial.rgb,
             self.initial.inverse_depth,
             self.camera,
@@ -167,7 +180,11 @@ class ViewCompletion:
         return channels.permute(2, 0, 1)[None].detach()
 
     def deltas(
-        self, network: ResidualNet | None, precision: Precision = "auto", *, dense: bool = False
+        self,
+        network: ResidualNet | None,
+        precision: Precision = "auto",
+        *,
+        cells: Tensor | None = None,
     ) -> Tensor | None:
         """The network's changes [h, w, 14] of the initial Gaussians (eq. 5), float32 on the CPU.
 
@@ -177,11 +194,13 @@ class ViewCompletion:
         Args:
             network: f_res, on any device.
             precision: of its convolutions; auto is bfloat16 if the hardware multiplies it natively.
-            dense: predict for all cells; otherwise cells without a hole get zeros.
+            cells: [h, w] bool: the cells that need deltas, all others get zeros; None: those with
+                at least one hole pixel.
         """
         if network is None:
             return None
-        cells = torch.ones_like(self.mask) if dense else self.mask
+        if cells is None:
+            cells = self.mask
         return predict_deltas(network, self.network_input(network.inputs), cells, precision)
 
     def gaussians(self, cells: Tensor, deltas: Tensor | None) -> Gaussians:
@@ -226,7 +245,7 @@ def complete_view(
     threshold: float = MASK_THRESHOLD,
     least: int = 0,
     rendering: Rendering | None = None,
-    photo: Tensor | Callable[[], Tensor] | None = None,
+    photo: Tensor | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
     """Gaussians that fill the holes of one view, as in the paper (𝒢̃_aug of eq. 7).
@@ -245,16 +264,14 @@ def complete_view(
         least: the least number of cells to fill: if fewer are holes, the `least` least opaque cells
             are filled (the paper trains with 64).
         rendering: the base as the view shows it, if already available.
-        photo: [H, W, 3] sRGB, for a network that names the input "photo", or a function that
-            returns it, which is called for such a network only; None: the base rendered from the
-            photo's camera.
+        photo: I of eq. 5, [H, W, 3] sRGB of the size of its camera, for a network that names the
+            input "photo". None, if the Gaussians came without a photo: the base rendered from the
+            photo's camera stands in.
         precision: of the network; auto is bfloat16 if the hardware multiplies it natively.
     """
 
-    def render_photo() -> Tensor:
+    def get_photo() -> Tensor:
         """The photo [H, W, 3], sRGB; called only if the network asks for it."""
-        if callable(photo):
-            return photo()
         if photo is not None:
             return photo
         return renderer.render(base, photo_camera).rgb
@@ -262,9 +279,9 @@ def complete_view(
     if rendering is None:
         rendering = renderer.render(base, camera)  # eqs. 2 and 3
     view_type = view_type_of(network, ViewCompletion)
-    view = view_type(rendering, camera, photo_camera, render_photo, threshold)
+    view = view_type(rendering, camera, photo_camera, get_photo, threshold)
     cells = view.cells(least)  # eq. 4
     if not bool(cells.any()):
         return Gaussians.empty(base.means.device)
-    deltas = view.deltas(network, precision)  # eq. 5
+    deltas = view.deltas(network, precision, cells=cells)  # eq. 5
     return view.gaussians(cells, deltas).to(base.means.device)  # eq. 7

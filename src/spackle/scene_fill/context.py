@@ -8,13 +8,15 @@ import copy
 import dataclasses
 import functools
 
+import torch
 from torch import Tensor
 
+from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual.completion import MIN_AUX_GAUSSIANS, complete_view, view_type_of
+from spackle.residual.completion import CellChoice, view_type_of
 from spackle.residual.features import MASK_THRESHOLD
 from spackle.residual.network import ResidualNet
 from spackle.runtime.device import Precision
@@ -62,11 +64,34 @@ class FillContext:
     threshold: float = MASK_THRESHOLD  # pixels with a lower opacity are holes
     # Of the network; auto is bfloat16 if the hardware multiplies it natively.
     precision: Precision = "auto"
+    # [H, W, 3] sRGB of the size of `photo_camera`: I of eq. 5, for a network that names the input
+    # "photo". None, if the Gaussians came without their photo: their rendering stands in.
+    photo: Tensor | None = dataclasses.field(default=None, repr=False, compare=False)
     # Shared by all contexts that `dataclasses.replace` makes of this one, so that none renders the
     # photo again.
     photo_cache: PhotoRendering = dataclasses.field(
         default_factory=PhotoRendering, repr=False, compare=False
     )
+
+    @staticmethod
+    def of(
+        prediction: BasePrediction,
+        renderer: Renderer,
+        network: ResidualNet | None = None,
+        *,
+        texture: Texture | None = exemplar_texture,
+        precision: Precision = "auto",
+    ) -> FillContext:
+        """The context of a base's prediction, with the photo that the base got; see the fields."""
+        return FillContext(
+            base=prediction.gaussians,
+            photo_camera=prediction.camera,
+            renderer=renderer,
+            network=network,
+            texture=texture,
+            precision=precision,
+            photo=prediction.photo,
+        )
 
     @functools.cached_property
     def on_renderer_device(self) -> FillContext:
@@ -97,32 +122,34 @@ class FillContext:
         """The surfaces that the photo shows, in front of which no new Gaussian may lie."""
         return OcclusionGuard.of(self.photo_rendering, self.photo_camera, self.threshold)
 
+    @torch.no_grad()
     def complete_as_paper(
-        self, camera: Camera, base_rendering: Rendering | None = None
+        self,
+        camera: Camera,
+        base_rendering: Rendering | None = None,
+        *,
+        cells: CellChoice = "masked",
     ) -> Gaussians:
         """The Gaussians that fill the holes of one view by the paper's method alone (eqs. 2 to 7).
 
-        There is one pass of the network, and one Gaussian for each cell of 2×2 pixels whose first
-        pixel is a hole; if these are fewer than 64, the 64 least opaque cells get one. Texture and
-        guards, which are beyond the paper, have no part in it.
+        There is one pass of the network, and one Gaussian for each chosen cell of 2×2 pixels.
+        Texture and guards, which are beyond the paper, have no part in it.
 
         Args:
             camera: of the view.
             base_rendering: the base as this camera sees it, if already available.
+            cells: "masked": the cells whose first pixel is a hole; if these are fewer than 64, the
+                64 least opaque cells. "all": every cell, with or without a hole, as in the dense
+                row of the paper's table tab:mask_guided_init.
         """
         context = self.on_renderer_device
-        return complete_view(
-            context.base,
-            camera,
-            context.photo_camera,
-            context.renderer,
-            context.network,
-            threshold=context.threshold,
-            least=MIN_AUX_GAUSSIANS,
-            rendering=base_rendering,
-            photo=lambda: context.photo_rendering.rgb,
-            precision=context.precision,
-        )
+        if base_rendering is None:
+            base_rendering = context.renderer.render(context.base, camera)
+        view = context.view(base_rendering, camera)
+        chosen_cells = view.chosen_cells(cells)
+        # The network's changes to a first guess of a Gaussian for each of these cells.
+        deltas = view.deltas(context.network, context.precision, cells=chosen_cells)
+        return view.gaussians(chosen_cells, deltas).to(context.base.means.device)
 
     def view(self, rendering: Rendering, camera: Camera) -> SceneViewCompletion:
         """The object that completes one view; its parts are computed when they are asked for.
@@ -136,8 +163,8 @@ class FillContext:
         if not issubclass(view_type, SceneViewCompletion):
             raise TypeError(f"{view_type.__name__} must be a subclass of SceneViewCompletion")
 
-        def render_photo() -> Tensor:
-            """The photo [H, W, 3], sRGB, as the base shows it."""
-            return self.photo_rendering.rgb
+        def get_photo() -> Tensor:
+            """The photo [H, W, 3], sRGB; its rendering, if the Gaussians came without a photo."""
+            return self.photo_rendering.rgb if self.photo is None else self.photo
 
-        return view_type(rendering, camera, self.photo_camera, render_photo, self.threshold)
+        return view_type(rendering, camera, self.photo_camera, get_photo, self.threshold)

@@ -38,6 +38,7 @@ def test_packaged_recipes(name: str) -> None:
             10_000,
         )
         assert (recipe.run.patience, recipe.run.min_delta) == (10, 1e-4)
+        assert recipe.data.crops is None  # whole views
         assert (recipe.loss.features, recipe.loss.feature_size, recipe.data.views) == (
             "resnet50",
             512,

@@ -26,7 +26,7 @@ from spackle.bases.sharp.network import SharpNetwork, SharpOutput, apply_deltas
 from spackle.bases.sharp.stretch import stretch_gaussians
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import Photo, working_size
+from spackle.core.photo import Photo, resize_photo, working_size
 from spackle.runtime.device import (
     Precision,
     pick_device,
@@ -127,7 +127,9 @@ class SharpBase:
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         width, height = working_size(photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
-        return BasePrediction(gaussians, camera.resized(width, height), notes)
+        return BasePrediction(
+            gaussians, camera.resized(width, height), notes, photo=resize_photo(photo).rgb
+        )
 
     @torch.no_grad()
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:

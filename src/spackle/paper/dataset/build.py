@@ -23,6 +23,7 @@ from rich.filesize import decimal
 from spackle.bases.open import BaseError, open_base
 from spackle.core.photo import load_photo, resize_photo
 from spackle.core.trajectories import DepthRange
+from spackle.paper.dataset.encoding import decode_gaussians, encode_gaussians
 from spackle.paper.dataset.options import DatasetOptions, completion_facts, dataset_configuration
 from spackle.paper.dataset.photos import PhotoFile, choose_photos, find_photos
 from spackle.paper.dataset.sample import pack_sample
@@ -120,6 +121,12 @@ class SampleMaker:
         photo = load_photo(file.path)
         # The second result says which base it was; here it is always the same.
         prediction, _ = self.base.predict(photo, options.find_depth(file))
+        # The dataset holds rounded Gaussians, so its views show these: whoever renders them again
+        # finds the same holes.
+        encoded_base = encode_gaussians(prediction.gaussians)
+        with as_input_error(file.path, "its Gaussians cannot be stored: {reason}", ValueError):
+            rounded_base = decode_gaussians(encoded_base)
+        prediction = dataclasses.replace(prediction, gaussians=rounded_base)
         kind, disparity = draw_random_path(
             options.trajectory, options.disparity, options.seed, file.sha256
         )
@@ -145,7 +152,9 @@ class SampleMaker:
             "threshold": MASK_THRESHOLD,
             "trajectory": {"kind": kind, "disparity": disparity},
         }
-        return pack_sample(file.key, resize_photo(photo).rgb, views, targets, facts)
+        return pack_sample(
+            file.key, resize_photo(photo).rgb, views, targets, facts, encoded_base=encoded_base
+        )
 
 
 class DatasetBuild:

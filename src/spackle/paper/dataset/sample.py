@@ -28,7 +28,6 @@ from spackle.paper.dataset.encoding import (
     decode_rgb,
     encode_alpha,
     encode_depth,
-    encode_gaussians,
     encode_mask,
     encode_rgb,
 )
@@ -54,7 +53,13 @@ class DatasetView:
 
 
 def pack_sample(
-    key: str, photo: Tensor, stack: ViewStack, targets: Tensor, facts: Mapping[str, Any]
+    key: str,
+    photo: Tensor,
+    stack: ViewStack,
+    targets: Tensor,
+    facts: Mapping[str, Any],
+    *,
+    encoded_base: bytes,
 ) -> bytes:
     """Pack a photo with its views for a tar archive.
 
@@ -69,6 +74,7 @@ def pack_sample(
         targets: [V, H, W, 3] sRGB, the completed views.
         facts: become part of the JSON; they must hold "threshold" (the opacity below which a pixel
             is masked) and "trajectory".
+        encoded_base: the photo's Gaussians, by `encode_gaussians`.
     """
     view_files: list[tuple[str, bytes]] = []  # names and contents
     view_facts: list[dict[str, Any]] = []
@@ -103,7 +109,7 @@ def pack_sample(
     files = [
         (f"{key}.json", text.encode()),
         (f"{key}.photo.png", encode_rgb(photo)),
-        (f"{key}.base.safetensors", encode_gaussians(stack.prediction.gaussians)),
+        (f"{key}.base.safetensors", encoded_base),
         *view_files,
     ]
     return b"".join(tar_member(name, content) for name, content in files)

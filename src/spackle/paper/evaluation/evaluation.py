@@ -62,12 +62,8 @@ class Evaluation:
 
     def fill_context(self, prediction: BasePrediction) -> FillContext:
         """What the methods need for filling the holes in views of a predicted scene."""
-        return FillContext(
-            base=prediction.gaussians,
-            photo_camera=prediction.camera,
-            renderer=self.renderer,
-            network=self.network,
-            precision=self.options.base.precision,
+        return FillContext.of(
+            prediction, self.renderer, self.network, precision=self.options.base.precision
         )
 
 

@@ -17,7 +17,7 @@ from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import hole_mask
 from spackle.scene_fill import FillContext, fill_scene, fill_view
-from spackle.scene_fill.occlusion_guard import OcclusionGuard, move_behind_surfaces
+from spackle.scene_fill.occlusion_guard import OcclusionGuard
 
 
 class MethodView(NamedTuple):
@@ -60,7 +60,8 @@ def make_method(
     if name == "paper-initial":
         return _on_top_of_base(context, context.without_network.complete_as_paper)
     if name == "dense":
-        return _on_top_of_base(context, partial(_dense_aux, context, context.photo_guard()))
+        # The paper's dense row differs from its method in nothing but the cells.
+        return _on_top_of_base(context, partial(context.complete_as_paper, cells="all"))
     if name == "spackle-scene":
         # `exact`: every view is checked, and every hole is filled, however small.
         scene_aux = fill_scene(context, cameras, exact=True).aux
@@ -110,24 +111,6 @@ def _fill_each_view(
     """
     filled = fill_view(context, camera, [photo_guard], base_rendering)
     return MethodView(rgb=filled.rendering.rgb, alpha=filled.rendering.alpha, aux=filled.aux)
-
-
-@torch.no_grad()
-def _dense_aux(
-    context: FillContext, photo_guard: OcclusionGuard, camera: Camera, base_rendering: Rendering
-) -> Gaussians:
-    """Gaussians to add to a view: one for every 2×2 pixels, whether or not there is a hole.
-
-    The paper's table tab:mask_guided_init compares this with Gaussians in the hole alone. All are
-    moved behind the surfaces that the photo shows, which `photo_guard` knows.
-    """
-    view = context.view(base_rendering, camera)
-    # A cell of 2×2 pixels gives one Gaussian. Deltas are the network's changes to a first guess of
-    # this Gaussian.
-    all_cells = torch.ones_like(view.mask)
-    deltas = view.deltas(context.network, context.precision, dense=True)
-    aux = view.gaussians(all_cells, deltas)
-    return move_behind_surfaces(aux, camera.position, [photo_guard])
 
 
 def _inpaint_2d(inpainter: Inpainter, camera: Camera, base_rendering: Rendering) -> MethodView:

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from spackle.core.trajectories import MAX_DISPARITY
 from spackle.residual.architectures import ARCHITECTURES
+from spackle.residual.completion import CellChoice
 from spackle.runtime.device import Precision
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
@@ -103,10 +104,11 @@ class DataRecipe(RecipePart):
         tuple[Disparity, Disparity], must_hold("must ascend", lambda pair: pair[0] <= pair[1])
     ] = (0.1, 0.6)
     views: Count = 20_000  # the paper: 20 views of 1,000 photos
-    crops: Annotated[Int, Field(ge=1, le=100)] = 3  # most crops of a view
+    # Most crops of a view; null: no crops, but the whole views of `pseudo`, as in evaluation.
+    crops: Annotated[Int, Field(ge=1, le=100)] | None = 3
     cells: Annotated[Int, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
     validation_views: Count = 100
-    cache: OptionalPath = None  # a folder for the samples; None: inside the output
+    cache: OptionalPath = None  # a folder for the crops; None: inside the output
     seed: Seed = 0  # for the samples alone: runs that differ only in run.seed share samples
 
 
@@ -202,6 +204,9 @@ class Recipe(AnyRecipe):
     loss: Section[LossRecipe] = LossRecipe()
     # Architecture of the residual: a built-in name, or a class of another package.
     network: Annotated[str, AfterValidator(check_network_name), MAY_CHANGE_ON_RESUME] = "unet"
+    # Which cells of a view (2×2 pixels) get an aux Gaussian in training: "masked" are those in
+    # holes, "all" is the paper's dense grid. Inference keeps the masked ones.
+    cells: CellChoice = "masked"
     init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
 
 

@@ -1,10 +1,12 @@
-"""Train the residual network on stored samples; the base does not change."""
+"""Train the residual network, on whole views or on crops; the base does not change."""
 
 from __future__ import annotations
 
 import abc
+import copy
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +24,7 @@ from spackle.paper.training.sample_factory import digest_of_samples, make_sample
 from spackle.paper.training.samples import Sample, load_sample
 from spackle.paper.training.sources import find_sources
 from spackle.paper.training.task import Task
+from spackle.paper.training.whole_views import WholeViews, find_whole_views
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import (
@@ -30,7 +33,7 @@ from spackle.residual.architectures import (
     network_class,
     open_residual,
 )
-from spackle.residual.completion import MIN_AUX_GAUSSIANS
+from spackle.residual.completion import CellChoice
 from spackle.residual.features import CELL, hole_area_ratio
 from spackle.residual.network import ResidualNet
 from spackle.residual.sharp_decoder import SharpDecoder
@@ -184,6 +187,7 @@ def complete_samples(
     samples: Sequence[Sample],
     renderer: Renderer,
     precision: torch.dtype = torch.float32,
+    cell_choice: CellChoice = "masked",
 ) -> ViewBatch:
     """Complete samples of one size; only the network gets gradients.
 
@@ -191,20 +195,22 @@ def complete_samples(
         network: the residual network, or a wrapper that distributes it over processes. It predicts
             deltas, changes of the Gaussians that fill each hole cell (2×2 pixels).
         inputs: the names of the network's inputs.
-        samples: views with holes, on the CPU.
+        samples: views with holes.
         renderer: draws the completed views; its device does the rest of the work, too.
         precision: of the network's convolutions.
+        cell_choice: which cells get a new Gaussian: those in holes, or all.
     """
     device = renderer.device
 
-    # The cells that get a new Gaussian (at least MIN_AUX_GAUSSIANS cells a view), and the
-    # renderer's tiles that these Gaussians can touch. They are read before the samples move to the
-    # renderer's device, because reading them there would wait for a GPU.
-    cells = [
-        sample.view.cells(MIN_AUX_GAUSSIANS).flatten().nonzero()[:, 0].to(device, non_blocking=True)
-        for sample in samples
-    ]
-    tiles = [sample.tiles for sample in samples]
+    # The cells that get a new Gaussian, and the renderer's tiles that these Gaussians can touch.
+    # They are read before the samples move to the renderer's device, because reading them there
+    # would wait for a GPU.
+    cells = []
+    tiles: list[Tensor | None] = []
+    for sample in samples:
+        index = sample.view.chosen_cells(cell_choice).flatten().nonzero()[:, 0]
+        cells.append(index.to(device, non_blocking=True))
+        tiles.append(sample.tiles if cell_choice == "masked" else None)  # None: all tiles
 
     # One pass of the network for all samples.
     features = torch.cat([sample.network_input(inputs) for sample in samples])
@@ -284,8 +290,27 @@ def _with_sharps_decoder(tensors: Mapping[str, Tensor], path: Path) -> SharpDeco
     return network
 
 
+@dataclasses.dataclass(frozen=True)
+class StoredCrops:
+    """Crops of views, each in a file of its own."""
+
+    files: Sequence[Path]
+
+    def __len__(self) -> int:
+        """The number of crops."""
+        return len(self.files)
+
+    def load(self, item: int) -> Sample:
+        """Read a crop, by its number; InputError if that fails."""
+        return load_sample(self.files[item])
+
+
 class ResidualTask(ViewTask):
-    """Trains the residual network; its items are samples, crops of views of one size."""
+    """Trains the residual network.
+
+    Its items are whole views of photos, one at a time because photos differ in size, or crops of
+    views, all of one size.
+    """
 
     name: ClassVar[str] = "residual"
 
@@ -297,17 +322,49 @@ class ResidualTask(ViewTask):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.run.seed)
             self.network = first_network(recipe.network, recipe.init).requires_grad_()
-        self.training_sources = find_sources(recipe.data, self.renderer, validation=False)
-        self.validation_sources = find_sources(recipe.data, self.renderer, validation=True)
-        self.digest = digest_of_samples(recipe.data, self.training_sources)
         self.items_per_step = recipe.optim.batch
 
-    def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Make the samples that do not exist yet; returns facts about all samples for run.json.
+        self.training: WholeViews | StoredCrops
+        self.validation: WholeViews | StoredCrops
+        if recipe.data.crops is None:
+            self.micro_batch = 1
+            whole_views = find_whole_views(recipe.data, self.network, self.renderer)
+            self.training = whole_views.training
+            self.validation = whole_views.validation
+            self.digest = whole_views.digest
+        else:
+            # A crop keeps only the Gaussians of the base near its holes.
+            if recipe.cells != "masked":
+                raise InputError(f"cells={recipe.cells}: needs whole views: set data.crops=null")
+            self.training_sources = find_sources(recipe.data, self.renderer, validation=False)
+            self.validation_sources = find_sources(recipe.data, self.renderer, validation=True)
+            self.digest = digest_of_samples(recipe.data, self.training_sources)
 
-        The facts are how many samples there are, and the PSNR of an untrained and of an ideal
-        network.
+    def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
+        """Make the crops that do not exist yet; returns facts about all samples for run.json.
+
+        Whole views need no preparation. The facts are how many samples there are, and the PSNR of
+        an untrained and of an ideal network.
         """
+        if self.recipe.data.crops is not None:
+            self._make_crops(output, reporter)
+        self.items = len(self.training)
+        self.validation_items = len(self.validation)
+        kind = "whole views" if self.recipe.data.crops is None else "crops"
+        reporter.log(f"{kind}: {self.items} for training, {self.validation_items} for validation")
+        return {
+            "samples": {
+                "kind": kind,
+                "train": self.items,
+                "validation": self.validation_items,
+                "digest": self.digest,
+            },
+            # Only the process of rank 0 writes run.json, so the others need not measure.
+            "hole_psnr": self.reachable_psnr() if rank() == 0 else {},
+        }
+
+    def _make_crops(self, output: Path, reporter: Reporter) -> None:
+        """Make the files of the crops that do not exist yet, with the other processes of a run."""
         data = self.recipe.data
         folder = data.cache or output / CACHE
         make_folder(folder)
@@ -320,7 +377,7 @@ class ResidualTask(ViewTask):
 
         # Training has even seeds and validation odd ones, so that no view is in both.
         with reporter.stage("samples") as progress:
-            self.validation_files = make_samples(
+            validation_files = make_samples(
                 data=data,
                 sources=self.validation_sources,
                 folder=folder / self.digest / "validation",
@@ -329,7 +386,7 @@ class ResidualTask(ViewTask):
                 progress=progress,
                 warn=log_once,
             )
-            self.training_files = make_samples(
+            training_files = make_samples(
                 data=data,
                 sources=self.training_sources,
                 folder=folder / self.digest / "train",
@@ -338,18 +395,8 @@ class ResidualTask(ViewTask):
                 progress=progress,
                 warn=log_once,
             )
-        self.items = len(self.training_files)
-        self.validation_items = len(self.validation_files)
-        reporter.log(f"{self.items} training samples, {self.validation_items} validation samples")
-        return {
-            "samples": {
-                "train": self.items,
-                "validation": self.validation_items,
-                "digest": self.digest,
-            },
-            # Only the process of rank 0 writes run.json, so the others need not measure.
-            "hole_psnr": self.reachable_psnr() if rank() == 0 else {},
-        }
+        self.validation = StoredCrops(validation_files)
+        self.training = StoredCrops(training_files)
 
     @torch.no_grad()
     def reachable_psnr(self) -> dict[str, float]:
@@ -363,15 +410,19 @@ class ResidualTask(ViewTask):
         # of the run.
         with torch.random.fork_rng(devices=[]):
             network = open_residual(self.recipe.network).to(self.renderer.device)
-        untrained: list[float] = []
-        with_target_colors: list[float] = []
+        values: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
         for item in range(self.validation_items):
             (sample,) = self.load_batch(step=None, items=[item])  # None: a validation item
-            untrained.append(self._sample_psnr(network, sample))
-            with_target_colors.append(self._sample_psnr(network, _with_target_colors(sample)))
+            # A view without a hole, such as the photo's own, has no PSNR.
+            if not bool(sample.hole.any()):
+                continue
+            values["untrained"].append(self._sample_psnr(network, sample))
+            values["colours of the targets"].append(
+                self._sample_psnr(network, _with_target_colors(sample))
+            )
         return {
-            "untrained": sum(untrained) / len(untrained),
-            "colours of the targets": sum(with_target_colors) / len(with_target_colors),
+            name: sum(numbers) / len(numbers) if numbers else math.nan
+            for name, numbers in values.items()
         }
 
     def _sample_psnr(self, network: nn.Module, sample: Sample) -> float:
@@ -381,8 +432,8 @@ class ResidualTask(ViewTask):
 
     def load_batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
         """Read samples, for validation if `step` is None; InputError if one cannot be read."""
-        files = self.validation_files if step is None else self.training_files
-        samples = [load_sample(files[item]) for item in items]
+        source = self.validation if step is None else self.training
+        samples = [source.load(item) for item in items]
 
         # Each sample computes its network input and its tiles once, and keeps them. This is done
         # here, in the thread that reads ahead, so that the training loop does not wait for it.
@@ -392,8 +443,20 @@ class ResidualTask(ViewTask):
         return samples
 
     def complete(self, network: nn.Module, batch: Sequence[Sample]) -> ViewBatch:
-        """Complete samples of one size; only the network gets gradients."""
+        """Complete samples of one size, as inference does: Gaussians in masked cells alone."""
         return complete_samples(network, self.network.inputs, batch, self.renderer, self.precision)
+
+    def loss(self, network: nn.Module, batch: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of samples, with Gaussians in the cells that the recipe's key `cells` names."""
+        views = complete_samples(
+            network,
+            self.network.inputs,
+            batch,
+            self.renderer,
+            self.precision,
+            self.recipe.cells,
+        )
+        return self._loss_of(views)
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in half precision, for `spackle predict --residual`."""
@@ -408,5 +471,6 @@ def _with_target_colors(sample: Sample) -> Sample:
     """The sample with initial Gaussians in the colours that the target shows at their cells."""
     rows, columns = sample.features.mask.shape
     cell_pixels = sample.target.view(rows, CELL, columns, CELL, 3)
-    initial = dataclasses.replace(sample.initial, rgb=cell_pixels.mean((1, 3)))
-    return dataclasses.replace(sample, initial=initial)
+    view = copy.copy(sample.view)
+    view.initial = dataclasses.replace(sample.initial, rgb=cell_pixels.mean((1, 3)))
+    return dataclasses.replace(sample, view=view)

@@ -17,7 +17,7 @@ from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Progress
 
-SAMPLES_VERSION = 7  # increase this whenever a recipe would give different samples
+SAMPLES_VERSION = 8  # increase this whenever a recipe would give different samples
 
 
 class Source(NamedTuple):
@@ -158,6 +158,7 @@ def _make_crops(
     if source.views is not None:
         number %= source.views  # a limited source begins again after its last view
     view = source.view(rng, number)
+    assert data.crops is not None  # whole views are no crops, and are not made here
     return random_crops(view, rng, count=data.crops, cells=data.cells)
 
 

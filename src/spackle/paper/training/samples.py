@@ -4,6 +4,7 @@ in files.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import os
@@ -93,14 +94,13 @@ class HoleSurroundings:
 class Sample:
     """A view of frozen Gaussians with holes, and the view's target. No tensor requires
     gradients.
+
+    What networks get as input is computed by `view`, when it is asked for, as in evaluation.
     """
 
-    camera: Camera
     base: Gaussians  # in a crop only the Gaussians that contribute to `tiles`
-    rendering: Rendering  # of the whole base
-    initial: InitialGaussians  # [h, w]: the first guess of what fills each cell of 2×2 pixels
-    surroundings: HoleSurroundings  # [h, w]
-    target: Tensor  # [H, W, 3] sRGB
+    view: SceneViewCompletion  # the completion of the base's view
+    target: Tensor  # [H, W, 3] sRGB, what the completed view should look like
 
     @staticmethod
     def of(
@@ -111,7 +111,7 @@ class Sample:
         photo: Tensor,
         target: Tensor,
     ) -> Sample:
-        """A sample of a whole view; it holds what every kind of residual network needs as input.
+        """A sample of a whole view.
 
         Args:
             base: the Gaussians predicted from a photo.
@@ -121,9 +121,62 @@ class Sample:
             photo: [H', W', 3] sRGB.
             target: [H, W, 3] sRGB, what the completed view should look like.
         """
-        rendering = rendering.detach()
-        view = SceneViewCompletion(rendering, camera, photo_camera, render_photo=lambda: photo)
-        surroundings = HoleSurroundings(
+        view = SceneViewCompletion(
+            rendering.detach(), camera, photo_camera, get_photo=lambda: photo
+        )
+        return Sample(base.detach(), view, target)
+
+    @staticmethod
+    def of_parts(
+        base: Gaussians,
+        rendering: Rendering,
+        camera: Camera,
+        initial: InitialGaussians,
+        surroundings: HoleSurroundings,
+        target: Tensor,
+    ) -> Sample:
+        """A sample of a crop, whose initial Gaussians and surroundings are those of its whole view.
+
+        A crop could not compute them, because it lacks what lies around it.
+        """
+        # The camera of the photo is not stored, so the crop's own camera takes its place. It is
+        # never used, because every part that depends on it is set below.
+        view = SceneViewCompletion(rendering, camera, photo_camera=camera)
+        view.initial = initial
+        view.far_rim = FarRim(
+            surroundings.rim_rgb, surroundings.mirrored_rgb, surroundings.rim_distance
+        )
+        view.patch_colors = surroundings.patch_rgb
+        view.patch_mismatch = surroundings.patch_mismatch
+        view.beyond_photo = surroundings.beyond_photo
+        view.photo_colors = surroundings.photo_rgb
+        return Sample(base, view, target)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the view."""
+        return self.view.camera
+
+    @property
+    def rendering(self) -> Rendering:
+        """The view of the whole base."""
+        return self.view.rendering
+
+    @property
+    def initial(self) -> InitialGaussians:
+        """[h, w]: the first guess of what fills each cell of 2×2 pixels."""
+        return self.view.initial
+
+    @property
+    def features(self) -> ViewFeatures:
+        """The rendered view, averaged in cells of 2×2 pixels."""
+        return self.view.features
+
+    @property
+    def surroundings(self) -> HoleSurroundings:
+        """[h, w]: the inputs of networks that a crop cannot compute by itself."""
+        view = self.view
+        return HoleSurroundings(
             rim_rgb=view.far_rim.rgb,
             mirrored_rgb=view.far_rim.mirrored,
             rim_distance=view.far_rim.distance,
@@ -132,40 +185,6 @@ class Sample:
             beyond_photo=view.beyond_photo,
             photo_rgb=view.photo_colors,
         )
-        return Sample(
-            camera=camera,
-            base=base.detach(),
-            rendering=rendering,
-            initial=view.initial,
-            surroundings=surroundings,
-            target=target,
-        )
-
-    @functools.cached_property
-    def view(self) -> SceneViewCompletion:
-        """The completion of the view, made of the stored parts.
-
-        Only the features, the inputs of networks, are not stored; they are computed on the CPU.
-        """
-        # The camera of the photo is not stored, so the view's own camera takes its place. It is
-        # never used, because every part that depends on it is stored, and set below.
-        view = SceneViewCompletion(self.rendering, self.camera, photo_camera=self.camera)
-        view.initial = self.initial
-        view.far_rim = FarRim(
-            self.surroundings.rim_rgb,
-            self.surroundings.mirrored_rgb,
-            self.surroundings.rim_distance,
-        )
-        view.patch_colors = self.surroundings.patch_rgb
-        view.patch_mismatch = self.surroundings.patch_mismatch
-        view.beyond_photo = self.surroundings.beyond_photo
-        view.photo_colors = self.surroundings.photo_rgb
-        return view
-
-    @property
-    def features(self) -> ViewFeatures:
-        """The rendered view, averaged in cells of 2×2 pixels; the sample must be on the CPU."""
-        return self.view.features
 
     @functools.cached_property
     def _network_inputs(self) -> dict[tuple[str, ...], Tensor]:
@@ -173,9 +192,7 @@ class Sample:
         return {}
 
     def network_input(self, names: tuple[str, ...]) -> Tensor:
-        """[1, C, h, w]: the named inputs of a network, kept for the next call; the sample must be
-        on the CPU.
-        """
+        """[1, C, h, w]: the named inputs of a network, on the CPU, kept for the next call."""
         if names not in self._network_inputs:
             self._network_inputs[names] = self.view.network_input(names)
         return self._network_inputs[names]
@@ -187,23 +204,29 @@ class Sample:
 
     @functools.cached_property
     def tiles(self) -> Tensor:
-        """[ceil(H/16), ceil(W/16)] bool: tiles of the renderer that aux Gaussians, which fill the
-        hole, can touch.
+        """[ceil(H/16), ceil(W/16)] bool, on the CPU: tiles of the renderer that aux Gaussians can
+        touch.
+
+        These are the tiles near the hole. A view with few hole pixels has aux Gaussians elsewhere,
+        too: its least opaque cells, so that there are at least 64.
         """
-        near_hole = maximum_filter(self.hole, HOLE_REACH_PX)
-        return max_pool2d(near_hole[None, None].float(), TILE_PX, ceil_mode=True)[0, 0] > 0
+        height, width = self.rendering.alpha.shape
+        cells = self.view.chosen_cells("masked")
+        cell_pixels = cells.repeat_interleave(CELL, 0).repeat_interleave(CELL, 1)
+        filled = self.hole.cpu() | cell_pixels[:height, :width]
+        near_filled = maximum_filter(filled, HOLE_REACH_PX)
+        return max_pool2d(near_filled[None, None].float(), TILE_PX, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
-        """The sample's tensors on another device; the camera stays on the CPU."""
+        """The sample on another device, with what composing and rendering need there.
+
+        The camera and the inputs of networks stay on the CPU.
+        """
         move = functools.partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
-        return dataclasses.replace(
-            self,
-            base=_map_tensors(self.base, move),
-            rendering=_map_tensors(self.rendering, move),
-            initial=_map_tensors(self.initial, move),
-            surroundings=_map_tensors(self.surroundings, move),
-            target=move(self.target),
-        )
+        view = copy.copy(self.view)
+        view.rendering = _map_tensors(self.rendering, move)
+        view.initial = _map_tensors(self.initial, move)
+        return Sample(_map_tensors(self.base, move), view, move(self.target))
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
         """Cut out height × width cells of 2×2 pixels, from the upper left cell (row, column).
@@ -224,10 +247,10 @@ class Sample:
             return grid[cells].clone()
 
         initial = _map_tensors(self.initial, cut_cells)
-        crop = Sample(
-            camera=camera,
+        crop = Sample.of_parts(
             base=self.base,
             rendering=_map_tensors(self.rendering, cut_pixels),
+            camera=camera,
             initial=dataclasses.replace(initial, uv=cell_centers(camera)),
             surroundings=_map_tensors(self.surroundings, cut_cells),
             target=cut_pixels(self.target),
@@ -335,10 +358,10 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
         for name_in_file, field in FIELDS_BY_FILE_NAME.items():
             part, _, name = field.partition(".")
             fields.setdefault(part, {})[name] = tensors[name_in_file]
-        return Sample(
-            camera=camera,
+        return Sample.of_parts(
             base=Gaussians(**fields["base"]),
             rendering=Rendering(**fields["rendering"]),
+            camera=camera,
             initial=InitialGaussians(
                 uv=cell_centers(camera),
                 **fields["initial"],

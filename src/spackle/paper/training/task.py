@@ -25,7 +25,7 @@ class Task(Protocol):
     #: The measure by which the best weights are chosen; lower is better.
     selection_measure: ClassVar[str] = "loss"
     #: Items in one pass through the network; the gradients of passes add up. None: all of a step.
-    micro_batch: ClassVar[int | None] = None
+    micro_batch: int | None = None
     #: Identifies the training data by content, not by paths.
     digest: str
     #: Items of a training step, over all processes.

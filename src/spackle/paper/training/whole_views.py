@@ -1,0 +1,126 @@
+"""Whole views of a dataset's photos as training samples: what is trained is what is evaluated.
+
+Each sample is made as `spackle evaluate` makes a view: from the photo's Gaussians and the view's
+camera, by the same `FillContext`. Nothing is cut, left out or stored in between.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+
+from spackle.bases import BasePrediction
+from spackle.paper.dataset.sample import PhotoGroup
+from spackle.paper.dataset.shards import DatasetFiles
+from spackle.paper.training.recipe import DataRecipe
+from spackle.paper.training.sample_factory import short_digest
+from spackle.paper.training.samples import Sample
+from spackle.paper.training.sources import open_pseudo_dataset, split_photos
+from spackle.render import Renderer
+from spackle.residual.network import ResidualNet
+from spackle.runtime.errors import InputError
+from spackle.scene_fill import FillContext
+
+# Photos kept in memory, because the views of a photo follow each other in validation. One of SHARP
+# has 40 MB of Gaussians.
+KEPT_PHOTOS = 2
+
+
+class SplitViews(NamedTuple):
+    """The whole views of a dataset, divided by photos."""
+
+    training: WholeViews
+    validation: WholeViews
+    digest: str  # identifies the views
+
+
+class WholeViews:
+    """All views of some photos of a dataset, numbered from 0: the views of each photo in a row."""
+
+    def __init__(
+        self, files: DatasetFiles, photos: Sequence[int], network: ResidualNet, renderer: Renderer
+    ) -> None:
+        """Number the views; nothing is read yet.
+
+        Args:
+            files: the dataset.
+            photos: the photos' indices in the dataset.
+            network: says which class computes its inputs.
+            renderer: renders the base from the views.
+        """
+        self.network = network
+        self.renderer = renderer
+        # The photo's index in the dataset, and the view's number.
+        self.views: list[tuple[int, int]] = []
+        for photo in photos:
+            _, entry = files.samples[photo]
+            self.views += [(photo, view) for view in range(len(entry.holes))]
+        self._read_photo = lru_cache(maxsize=KEPT_PHOTOS)(files.__getitem__)
+
+        # Threads that read samples begin with CUDA's device 0, whatever this process uses.
+        self._cuda_device: int | None = None
+        if renderer.device.type == "cuda":
+            self._cuda_device = torch.cuda.current_device()
+
+    def __len__(self) -> int:
+        """The number of views."""
+        return len(self.views)
+
+    def load(self, item: int) -> Sample:
+        """A view by its number, with its target; InputError if the dataset is damaged."""
+        photo_index, view_index = self.views[item]
+        photo = self._read_photo(photo_index)
+        with self._on_renderer_device():
+            return self._make_sample(photo, view_index)
+
+    @torch.no_grad()
+    def _make_sample(self, photo: PhotoGroup, view_index: int) -> Sample:
+        """One view of a photo, rendered from the photo's Gaussians as evaluation renders it.
+
+        The dataset's own pictures of the view are not used, because they have 8 bits.
+        """
+        view = photo.view(view_index)
+        base = photo.base.to(self.renderer.device)
+        prediction = BasePrediction(base, view.photo_camera, notes={}, photo=view.photo)
+        context = FillContext.of(prediction, self.renderer, self.network)
+        rendering = self.renderer.render(context.base, view.camera)
+        return Sample(context.base, context.view(rendering, view.camera), view.target)
+
+    def _on_renderer_device(self) -> AbstractContextManager[object]:
+        """A block in which CUDA's current device is the renderer's."""
+        if self._cuda_device is None:
+            return contextlib.nullcontext()
+        return torch.cuda.device(self._cuda_device)
+
+
+def find_whole_views(data: DataRecipe, network: ResidualNet, renderer: Renderer) -> SplitViews:
+    """The whole views of a recipe's dataset, for training and for validation.
+
+    All views count, also those with few holes or none, as the photo's own, and small photos.
+
+    Args:
+        data: names the dataset, and the numbers of views.
+        network: the network that is trained.
+        renderer: renders the base from the views.
+
+    Raises:
+        InputError: the recipe names other data, or the dataset cannot be used.
+    """
+    has_other_data = data.photos is not None or data.rgbd or data.stereo is not None
+    if data.pseudo is None or has_other_data:
+        raise InputError(
+            "data.crops=null: whole views come from data.pseudo alone, a dataset of `spackle "
+            "dataset build`: leave out data.photos, data.rgbd and data.stereo, or set data.crops=1"
+        )
+    files = open_pseudo_dataset(data.pseudo)
+    training_photos, validation_photos = split_photos(files, data)
+    return SplitViews(
+        training=WholeViews(files, training_photos, network, renderer),
+        validation=WholeViews(files, validation_photos, network, renderer),
+        digest=short_digest((files.manifest.digest, training_photos, validation_photos)),
+    )
