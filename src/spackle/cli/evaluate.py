@@ -68,6 +68,12 @@ def evaluate(
     direct_ft: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")
     ] = None,
+    dense_residual: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Weights of the method dense, if not those of the residual."
+        ),
+    ] = None,
     inpainter: Annotated[
         str,
         typer.Option(metavar="NAME", help=f"Inpainter of the method inpaint2d: {INPAINTERS}."),
@@ -121,6 +127,7 @@ def evaluate(
         ),
         residual=residual,
         direct_ft=direct_ft,
+        dense_residual=dense_residual,
         inpainter=inpainter,
         features=features,
         limit=limit,

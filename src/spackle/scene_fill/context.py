@@ -149,7 +149,7 @@ class FillContext:
         chosen_cells = view.chosen_cells(cells)
         # The network's changes to a first guess of a Gaussian for each of these cells.
         deltas = view.deltas(context.network, context.precision, cells=chosen_cells)
-        return view.gaussians(chosen_cells, deltas).to(context.base.means.device)
+        return view.gaussians(chosen_cells, deltas).to(self.base.means.device)
 
     def view(self, rendering: Rendering, camera: Camera) -> SceneViewCompletion:
         """The object that completes one view; its parts are computed when they are asked for.

@@ -113,7 +113,10 @@ def test_untrained_views_equal_the_datasets_views(place: Path) -> None:
     with torch.no_grad():
         batch = render_views_of_photo(base.network.gaussian_decoder(), base, views, get_renderer())
     assert batch.rgb.shape == (VIEWS, HEIGHT, WIDTH, 3)
-    assert float((batch.rgb - batch.base_rgb).abs().max()) < 1.01 / 510  # 8 bits
+    # A dataset rounds Gaussians, and then its pictures to 8 bits.
+    difference = (batch.rgb - batch.base_rgb).abs()
+    assert float(difference.max()) < 2.5 / 510
+    assert float(difference.mean()) < 0.5 / 510
     assert torch.equal(batch.alpha < 0.95, batch.hole)
 
 

@@ -6,6 +6,7 @@ evaluations.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -225,7 +226,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement],
 
     # All methods start from the same Gaussians.
     context = evaluation.fill_context(prediction)
-    methods = _methods(evaluation, loaded, context, scale)
+    methods = methods_of_case(evaluation, loaded, context, scale)
     title = str(evaluation.config["title"])
     measurements, pictures = measure_views(
         title, case.name, context, viewpoints, methods, evaluation.suite
@@ -279,7 +280,7 @@ def _scale_of_base(loaded: LoadedCase, prediction: BasePrediction, evaluation: E
     return align(loaded.case, rendering.depth, ~hole_mask(rendering.alpha))
 
 
-def _methods(
+def methods_of_case(
     evaluation: Evaluation, loaded: LoadedCase, context: FillContext, scale: float | None
 ) -> dict[str, Method]:
     """The compared methods by name, for the views of one photo.
@@ -301,7 +302,10 @@ def _methods(
 
     def built_in_method(name: str, cameras: Sequence[Camera]) -> Fill:
         """One of `METHODS`, for all views of a setting."""
-        return make_method(name, cameras, context, evaluation.inpainter, tuned_gaussians)
+        own_context = context
+        if name == "dense":
+            own_context = dataclasses.replace(context, network=evaluation.dense_network)
+        return make_method(name, cameras, own_context, evaluation.inpainter, tuned_gaussians)
 
     def plugin_method(name: str, cameras: Sequence[Camera]) -> Fill:
         """A method of another package, named `package.module:Name`, for all views of a setting."""

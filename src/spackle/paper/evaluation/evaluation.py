@@ -25,6 +25,7 @@ from spackle.paper.training.feature_networks import load_features
 from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
+from spackle.residual.architectures import load_residual
 from spackle.runtime.device import pick_dtype
 from spackle.runtime.digests import json_digest
 from spackle.scene_fill import FillContext
@@ -42,6 +43,7 @@ class Evaluation:
     base: OpenedBase  # turns photos into Gaussians; `base_of_case` is the one to use
     tuned_base: OpenedBase | None  # for the method direct-ft
     network: ResidualNet | None  # makes the Gaussians that are added
+    dense_network: ResidualNet | None  # the same for the method dense
     inpainter: Inpainter | None  # for the method inpaint2d
     renderer: Renderer
     suite: MetricSuite
@@ -84,6 +86,9 @@ def open_evaluation(options: EvaluateOptions, earlier_metrics: Sequence[str] = (
     options.check()
     cases = _cases_to_evaluate(options)
     network = FillOptions(residual=options.residual).load_network()
+    dense_network = network
+    if options.dense_residual is not None:
+        dense_network = load_residual(options.dense_residual)
 
     inpainter = None
     if "inpaint2d" in options.methods:
@@ -103,6 +108,7 @@ def open_evaluation(options: EvaluateOptions, earlier_metrics: Sequence[str] = (
         base=open_base(options.settings_of_base),
         tuned_base=tuned_base,
         network=network,
+        dense_network=dense_network,
         inpainter=inpainter,
         renderer=renderer,
         suite=suite,
@@ -215,6 +221,8 @@ def _configuration(
     }
     if label.about:
         config["about_scenes"] = label.about
+    if options.dense_residual is not None:
+        config["dense_residual"] = weights_digest(options.dense_residual)
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.weight_files.items()}
         config["inpainter"] = {

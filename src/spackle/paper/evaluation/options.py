@@ -56,6 +56,9 @@ class EvaluateOptions:
         None  # a file of weights, or "initial"; None: the shipped weights, if any
     )
     direct_ft: Path | None = None  # weights of the method direct-ft
+    # Weights of the residual network for the method dense, which should be trained with Gaussians
+    # in all cells; None: those of `residual`.
+    dense_residual: Path | None = None
     inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
     second_views: SecondViews = "all"  # which second photos of a case near views use
@@ -115,6 +118,12 @@ class EvaluateOptions:
             check_name_or_plugin("methods", method, METHODS)
             if is_plugin(method):
                 load_function(method, "methods")
+
+        if self.dense_residual is not None and "dense" not in self.methods:
+            raise InputError(
+                f"`dense_residual` {self.dense_residual}: weights of the method dense, which is "
+                "not among the `methods`: add it, or leave the weights out"
+            )
 
         # Direct FT trains SHARP's own weights, so no other base has such a file.
         has_tuned_base = self.base.name == "sharp" and self.direct_ft is not None
