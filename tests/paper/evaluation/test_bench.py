@@ -8,11 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from helpers import evaluation_data
 from helpers.command import names_in, refuses, run
 from helpers.scenes import box_before_wall
 
+from spackle.bases.depth import RgbdBase
 from spackle.bases.settings import BaseSettings
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.patch_matching import Patches, match_patches
 from spackle.paper.evaluation import bench
 from spackle.paper.evaluation.case import Points
 from spackle.paper.evaluation.evaluation import open_evaluation
@@ -26,11 +31,13 @@ from spackle.paper.evaluation.options import TIMED_METHODS, BenchOptions
 from spackle.paper.evaluation.paper_numbers import PAPER_PARAMETERS, PAPER_TABLES
 from spackle.paper.evaluation.protocols import large_views
 from spackle.paper.evaluation.tables import make_tables
-from spackle.render import get_renderer
+from spackle.render import CpuRenderer, get_renderer
+from spackle.render.protocol import Rendering, as_sets
+from spackle.residual import ResidualNet
 from spackle.residual.architectures import open_residual
+from spackle.residual.composer import DELTA_CHANNELS
 from spackle.runtime.errors import InputError
-from spackle.scene_fill import FillContext, fill_view
-from spackle.scene_fill.unet import UNet
+from spackle.scene_fill import FillContext, SceneViewCompletion, fill_view
 from spackle.weights import PUBLISHED_WEIGHTS
 
 EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
@@ -38,7 +45,9 @@ PAPER_LABELS = {table.label for table in PAPER_TABLES}  # the paper's six tables
 STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 13.0}
 
 
-def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
+def results(
+    title: str = "Middlebury", factor: float = 1.0, base_parameters: int | None = 2_000_000
+) -> Results:
     """A run of three images, the second twice as slow and the third four times as slow, and one
     failed image."""
     config: dict[str, Any] = {
@@ -71,6 +80,8 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
     for k in range(3):
         image = Measurement(title, f"image {k}", "", "", "", "", None)
         rows.append(image._replace(metric="note.precision", value="bf16"))
+        rows.append(image._replace(metric="base_parameters", value=base_parameters))
+        rows.append(image._replace(metric="residual_parameters", value=8_000_000))
         for disparity in config["disparities"]:
             view = image._replace(setting=f"{disparity:g}", view="right")
             for method, count in (("paper", 10 * k), ("spackle", 40 * k)):
@@ -84,19 +95,44 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
                     for name, value in numbers
                 ]
     rows.append(Measurement(title, "broken", "", "", "", "problem", "no such file"))
-    return Results(config, rows, {"parameters": bench.count_parameters(UNet())})
+    return Results(config, rows)
 
 
 @pytest.mark.parametrize(("name", "count"), [("unet", 8_023_153), ("sharp-decoder", 8_022_894)])
 def test_the_networks_have_the_papers_parameters(name: str, count: int) -> None:
     found = bench.count_parameters(open_residual(name))
-    paper = PAPER_PARAMETERS
-    assert (found["base"], found["residual"]) == (702_305_169, count)
-    assert round(found["base"] / 1e6, 2) == paper.base_m
-    assert round(found["residual"] / 1e6, 2) == paper.residual_m
-    assert round(100 * found["share"], 2) == paper.share_percent
-    assert (found["base"] + found["residual"]) / 1e6 == pytest.approx(paper.merged_m, abs=0.01)
-    assert 0.9 * found["base"] < found["base_used"] < found["base"]
+    assert found == count
+    assert round(count / 1e6, 2) == PAPER_PARAMETERS.residual_m
+
+
+@pytest.mark.parametrize(
+    ("base_parameters", "text"),
+    [
+        (2_000_000, "base SHARP 2.00; residual 8.00 (400.00 %), together 10.00. The paper: 702.31"),
+        (0, "base SHARP –; residual 8.00. The paper: 702.31"),
+        (None, "base SHARP not counted; residual 8.00. The paper: 702.31"),
+    ],
+)
+def test_the_notes_count_the_networks_that_ran(base_parameters: int | None, text: str) -> None:
+    (_, table) = make_tables([results(base_parameters=base_parameters)])
+    (note,) = (note for note in table.notes if note.startswith("Parameters"))
+    assert text in note
+
+
+class SharedNetworks:
+    """A base with two networks, one of them twice, as in a list of its parts."""
+
+    def __init__(self) -> None:
+        part = torch.nn.Linear(3, 2)  # 8 numbers
+        self.networks = [part, torch.nn.Linear(1, 1, bias=False)]
+        self.head = part
+        self.name = "own"
+
+
+def test_parameters_are_counted_once_and_only_in_networks() -> None:
+    assert bench.count_parameters(SharedNetworks()) == 9
+    depth_map = box_before_wall().depth_map
+    assert bench.count_parameters(RgbdBase(depth_map)) is None
 
 
 def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
@@ -151,6 +187,98 @@ def test_a_view_costs_what_a_completion_adds() -> None:
     assert stages == [*bench.BASE_STAGES[1:], *bench.COMPLETION_STAGES] * 2
 
 
+class CountingRenderer(CpuRenderer):
+    """Notes each rendering, and whether it could use what was prepared for the same tensors."""
+
+    def __init__(self, events: list[str], photo_camera: Camera) -> None:
+        self.events = events
+        self.photo_camera = photo_camera
+        self.prepared: list[torch.Tensor] = []  # kept, so that no identity is used twice
+
+    def render(  # type: ignore[override]
+        self, gaussians: Gaussians | list[Gaussians], camera: Camera, **options: Any
+    ) -> Rendering:
+        sets = as_sets(gaussians)
+        is_prepared = any(sets[0].means is means for means in self.prepared)
+        self.prepared.append(sets[0].means)
+        place = "photo" if camera is self.photo_camera else "view"
+        self.events.append(f"{place} with {len(sets)} {'prepared' if is_prepared else 'new'}")
+        return super().render(gaussians, camera, **options)
+
+
+FIRST = ["view with 1 new", "end of view"]
+SECOND = ["view with 2 prepared", "end of completion"]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "method", "expected", "searches"),
+    [
+        (("alpha", "mask"), "paper", [*FIRST, "end of photo", *SECOND], 0),
+        (
+            ("mask", "photo"),
+            "paper",
+            [*FIRST, "end of photo", "photo with 1 prepared", *SECOND],
+            0,
+        ),
+        (("mask", "patches"), "paper", [*FIRST, "end of photo", *SECOND], 1),
+        (
+            ("mask",),
+            "spackle",
+            # The photo's guard; and two passes, of which only the first has a texture.
+            [
+                *FIRST,
+                "photo with 1 prepared",
+                "end of photo",
+                SECOND[0],
+                "view with 3 prepared",
+                SECOND[1],
+            ],
+            1,
+        ),
+    ],
+)
+def test_each_run_renders_and_computes_what_its_method_needs_and_nothing_else(
+    inputs: tuple[str, ...],
+    method: str,
+    expected: list[str],
+    searches: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Network(ResidualNet):
+        name = "few-inputs"
+        local = False
+        view_type = SceneViewCompletion
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.unused = torch.nn.Parameter(torch.zeros(1))
+
+        def forward(self, features: torch.Tensor) -> torch.Tensor:
+            return features.new_zeros(1, DELTA_CHANNELS, *features.shape[-2:])
+
+    Network.inputs = inputs
+    events: list[str] = []
+    found_searches: list[int] = []
+
+    def counted_search(*arguments: Any) -> Patches:
+        found_searches.append(1)
+        return match_patches(*arguments)
+
+    monkeypatch.setattr("spackle.scene_fill.view_completion.match_patches", counted_search)
+    prediction = box_before_wall().lift()
+    renderer = CountingRenderer(events, prediction.camera)
+    context = FillContext(prediction.gaussians, prediction.camera, renderer, Network())
+    camera = large_views(prediction, (0.3,), 1280)[0].camera
+    for _ in range(2):  # the second run may not use what the first has left
+        events.clear()
+        found_searches.clear()
+        bench.complete_view_in_stages(
+            context, camera, lambda stage: events.append(f"end of {stage}"), method
+        )
+        assert events == expected
+        assert len(found_searches) == searches
+
+
 def test_points_suffice_and_without_depth_a_case_is_refused(scenes: Path) -> None:
     options = BenchOptions(
         dataset="middlebury",
@@ -190,7 +318,10 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
     assert done.code == 0, done.err
     assert names_in(output) == {"rows.jsonl", "bench.md", "bench.tex", "config.json", "images"}
     found = load_run(output)
-    assert found.about["parameters"]["residual"] == 8_023_153
+    parameters = {
+        row.metric: row.value for row in found.measurements if row.metric.endswith("parameters")
+    }
+    assert parameters == {"base_parameters": 0, "residual_parameters": 8_023_153}
     assert (found.settings, found.measured_images) == (["0.3", "0.5"], ["Ball", "Door"])
     values = group_values(found.measurements, "metric", "setting", "method")
     for setting in found.settings:

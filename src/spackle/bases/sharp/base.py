@@ -44,7 +44,6 @@ ADVICE = "give SHARP's checkpoint as it was downloaded"
 MEMORY_ADVICE = "try `windows_per_batch` 1 and `precision` bf16"
 # A decoder file's only metadata key, with a value in JSON: safetensors shuffles several keys.
 SOURCE_KEY = "spackle.gaussian_decoder"
-PARAMETER_COUNT = 702_305_169  # in Apple's checkpoint, with the unused ones
 _ENCODER_PREFIX = "monodepth_model.monodepth_predictor.encoder."
 # Tensors that are never read: the transformers' classifiers, and a U-Net that only training uses.
 UNUSED_PREFIXES = (

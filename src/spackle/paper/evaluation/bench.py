@@ -15,12 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import nn
 
-from spackle.bases import BasePrediction
+from spackle.bases import Base, BasePrediction
 from spackle.bases.open import OpenedBase
-from spackle.bases.sharp.base import PARAMETER_COUNT
-from spackle.bases.sharp.encoder import FULL_SIZE
-from spackle.bases.sharp.network import SharpNetwork
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
@@ -34,14 +32,16 @@ from spackle.paper.evaluation.folder import (
     write_measurements,
 )
 from spackle.paper.evaluation.measurements import (
+    BASE_PARAMETERS,
     NOTE_PREFIX,
+    RESIDUAL_PARAMETERS,
     Measurement,
     Run,
     Value,
     image_measurement,
 )
 from spackle.paper.evaluation.methods import make_method
-from spackle.paper.evaluation.options import TIMED_METHODS, BenchOptions
+from spackle.paper.evaluation.options import TIMED_METHODS, BenchOptions, EvaluateOptions
 from spackle.paper.evaluation.protocols import large_views
 from spackle.paper.evaluation.tables import make_tables, write_tables
 from spackle.residual import ResidualNet
@@ -68,11 +68,11 @@ CONFIG_KEYS_OF_EVALUATION = (
     "device",
 )
 
-# The stages of a view without Spackle: from the photo to the base's Gaussians, rendering of the
-# view.
+# The stages of a view without Spackle: from the photo to the base's Gaussians on the renderer's
+# device; and the rendering of the view, which Spackle needs as well, to find the holes in it.
 BASE_STAGES = ("base", "view")
-# The stages that Spackle adds: rendering at the photo's camera, from the mask to the completed
-# view.
+# The stages that Spackle adds: what a method needs of the photo's own view; and all from the mask
+# to the completed view, with its rendering.
 COMPLETION_STAGES = ("photo", "completion")
 TOTAL_STAGE = "total"  # all stages of a task
 
@@ -111,7 +111,7 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> Run | None
         root=options.root,
         output=output,
         config=config,
-        about={"parameters": count_parameters(evaluation.network)},
+        about={},  # the configuration has machine and versions
     )
 
     def measure(index: int, case: Case) -> ImageResults:
@@ -189,7 +189,7 @@ def time_case(
     options = evaluation.options
     loaded = load_case(case, options.max_side)
     base = evaluation.base_of_case(loaded)
-    base.load(loaded.full_photo)  # loading the network is not timed
+    loaded_base = base.load(loaded.full_photo)  # loading the network is not timed
 
     timed_base = _time_base(base, loaded.full_photo, evaluation, base_runs)
     prediction = timed_base.prediction
@@ -200,6 +200,7 @@ def time_case(
         "width": loaded.photo.width,
         "height": loaded.photo.height,
         "base_gaussians": len(prediction.gaussians),
+        **_parameter_facts(loaded_base, evaluation.network, options),
     }
     # A base may add notes, such as its network's number format.
     for name, value in prediction.notes.items():
@@ -257,6 +258,8 @@ def _time_base(
         nonlocal prediction
         # `predict` also returns which base made the prediction, but a benchmark has only one.
         prediction, _ = base.predict(photo)
+        # The Gaussians cannot be rendered before they are where the renderer is.
+        prediction.gaussians.to(evaluation.renderer.device)
 
     # An untimed first run keeps the compilation of kernels out of the times. SHARP on a CPU needs
     # none: a prediction takes a minute, and compilation is a small part of it.
@@ -344,32 +347,46 @@ def _median_ms(seconds: RunValues) -> float:
     return MS_PER_S * float(np.median(seconds))
 
 
-def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
-    """The numbers of network parameters that the tables of costs compare.
+def count_parameters(owner: object) -> int | None:
+    """The number of parameters in the networks of a base or of another object.
 
     Args:
-        residual: the residual network; None: there is none.
+        owner: a PyTorch network, or an object whose attributes are networks or lists of networks.
+            A parameter that several networks share counts once.
 
     Returns:
-        "base": of SHARP's published checkpoint (702.31 million). "base_used": of the part that
-        inference uses, without classifiers and the part that aligns depths. "residual": of the
-        residual network. "share": the residual network's over SHARP's.
+        The number; None if the object holds no PyTorch network.
     """
-    # On the device "meta" parameters have shapes but no memory, which is enough to count them.
-    with torch.device("meta"):
-        sharp = SharpNetwork(FULL_SIZE)  # with the widths of the published network
-    used_count = sum(parameter.numel() for parameter in sharp.parameters())
+    attributes = [owner] if isinstance(owner, nn.Module) else list(vars(owner).values())
+    networks = []
+    for value in attributes:
+        # The base lite keeps its two networks in a list.
+        items = value if isinstance(value, list | tuple) else [value]
+        networks += [item for item in items if isinstance(item, nn.Module)]
+    if not networks:
+        return None
 
-    residual_count = 0
-    if residual is not None:
-        residual_count = sum(parameter.numel() for parameter in residual.parameters())
-
-    return {
-        "base": PARAMETER_COUNT,  # of all networks in SHARP's published checkpoint
-        "base_used": used_count,
-        "residual": residual_count,
-        "share": residual_count / PARAMETER_COUNT,
+    parameters = {
+        id(parameter): parameter.numel()
+        for network in networks
+        for parameter in network.parameters()
     }
+    return sum(parameters.values())
+
+
+def _parameter_facts(
+    base: Base | None, residual: ResidualNet | None, options: EvaluateOptions
+) -> dict[str, Value]:
+    """The numbers of parameters of the networks that ran for an image, for its measurements.
+
+    A number is 0 without a network; that of a base is None if its network is none of PyTorch's, and
+    so cannot be counted.
+    """
+    base_count: int | None = 0
+    if options.base.uses_network and base is not None:
+        base_count = count_parameters(base)
+    residual_count = 0 if residual is None else count_parameters(residual)
+    return {BASE_PARAMETERS: base_count, RESIDUAL_PARAMETERS: residual_count}
 
 
 # --- the clock
@@ -450,9 +467,12 @@ def complete_view_in_stages(
     Returns:
         The Gaussians that the method adds for the view.
     """
-    # The cache of the photo's rendering starts empty, because each timed run must render the photo
-    # from its own camera again.
-    context = dataclasses.replace(context.on_renderer_device, photo_cache=PhotoRendering())
+    # Nothing of an earlier run or view may help: the cache of the photo's rendering starts empty,
+    # and the Gaussians are new tensors (of the same memory), which the GPU renderer has not
+    # prepared yet.
+    context = context.on_renderer_device
+    base = Gaussians(*(tensor.detach() for tensor in context.base.tensors))
+    context = dataclasses.replace(context, base=base, photo_cache=PhotoRendering())
     base_rendering = context.renderer.render(context.base, camera)
     end_stage("view")
 

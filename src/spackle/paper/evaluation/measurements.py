@@ -25,6 +25,10 @@ PROBLEM_METRIC = "problem"
 REMARK_METRIC = "remark"
 NOTE_PREFIX = "note."
 
+# In benchmarks, facts about an image: how many parameters the networks that ran have.
+BASE_PARAMETERS = "base_parameters"
+RESIDUAL_PARAMETERS = "residual_parameters"
+
 Value = float | str | None
 
 

@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from spackle.paper.evaluation.measurements import NOTE_PREFIX, Run
+from spackle.paper.evaluation.measurements import (
+    BASE_PARAMETERS,
+    NOTE_PREFIX,
+    RESIDUAL_PARAMETERS,
+    Run,
+)
 from spackle.paper.evaluation.method_descriptions import describe_method
 from spackle.paper.evaluation.metrics import METRICS, metric_of_column
 from spackle.paper.evaluation.paper_numbers import PAPER_PARAMETERS
@@ -17,6 +22,16 @@ from spackle.paper.evaluation.table_layouts import ColumnLayout, TableLayout
 
 # Marks methods whose residual network was not trained by the paper's recipe.
 RECIPE_MARK = "‡"
+# What the times of tables include.
+TIMED_WORK_NOTE = (
+    "Base time: from the photo in memory to its Gaussians, and one rendering of the view. Spackle "
+    "time: the base's time, in whose rendering the holes are found, and all that completion adds: "
+    "mask, initial Gaussians, the inputs that the network names, the network, and a second "
+    "rendering of the view with the added Gaussians. If a network names the photo, or a method "
+    "guards it, a rendering at the photo's camera is included. No run uses what another has "
+    "computed."
+)
+NO_NETWORK = "–"  # instead of a number of parameters
 MAX_LISTED_IMAGES = 5  # the most names in a note about images that could not be measured
 
 
@@ -206,7 +221,7 @@ def _missing_images_notes(run: Run) -> list[str]:
 
 def _timing_notes(run: Run) -> list[str]:
     """Notes on a benchmark: machine and number formats, timed runs, sizes of networks."""
-    return [_machine_note(run), _timed_runs_note(run), _parameters_note(run)]
+    return [_machine_note(run), TIMED_WORK_NOTE, _timed_runs_note(run), _parameters_note(run)]
 
 
 def _machine_note(run: Run) -> str:
@@ -247,17 +262,38 @@ def _timed_runs_note(run: Run) -> str:
 
 
 def _parameters_note(run: Run) -> str:
-    """The note on the numbers of network parameters, counted here and as the paper has them."""
-    counts = run.about["parameters"]
-    base_m = counts["base"] / 1e6  # millions
-    used_m = counts["base_used"] / 1e6
-    residual_m = counts["residual"] / 1e6
-    share_percent = 100 * counts["share"]
+    """The note on the numbers of parameters of the networks that ran, and of the paper's."""
+    base_count = _fact_of_images(run, BASE_PARAMETERS)
+    residual_count = _fact_of_images(run, RESIDUAL_PARAMETERS)
+    base_text = _millions(base_count)
+    residual_text = _millions(residual_count)
+
+    # A sum and a share need both networks.
+    together = ""
+    if base_count and residual_count:
+        share_percent = 100 * residual_count / base_count
+        total = _millions(base_count + residual_count)
+        together = f" ({share_percent:.2f} %), together {total}"
 
     paper = PAPER_PARAMETERS
     return (
-        f"Parameters in millions, counted in the networks: SHARP {base_m:.2f}, of which inference "
-        f"uses {used_m:.2f}; with Spackle {base_m + residual_m:.2f}; Spackle alone "
-        f"{residual_m:.2f} ({share_percent:.2f} %). The paper: {paper.base_m}, {paper.merged_m}, "
-        f"{paper.residual_m} ({paper.share_percent} %)."
+        "Parameters in millions, counted in the networks that ran: "
+        f"base {run.base_title} {base_text}; residual {residual_text}{together}. The paper: "
+        f"{paper.base_m}, {paper.residual_m} ({paper.share_percent} %), together "
+        f"{paper.merged_m}; it counts all of SHARP's checkpoint, of which inference uses a part."
     )
+
+
+def _fact_of_images(run: Run, metric: str) -> float | None:
+    """A number that all images of a run share; None if it is unknown."""
+    for measurement in run.measurements:
+        if measurement.metric == metric and isinstance(measurement.value, int | float):
+            return float(measurement.value)
+    return None
+
+
+def _millions(count: float | None) -> str:
+    """A number of parameters in millions; "–" without a network."""
+    if count is None:
+        return "not counted"
+    return f"{count / 1e6:.2f}" if count else NO_NETWORK
