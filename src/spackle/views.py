@@ -106,20 +106,10 @@ class PathOptions:
             )
 
     def _check_files(self) -> None:
-        """Raise an InputError if a file of views is given together with `path` or a size.
-
-        The file already says from where the scene is seen, and how large each view is.
-        """
-        if self.cameras is None:
-            return
-        if self.path is not None:
+        """Raise an InputError if a file of views is given together with `path`."""
+        if self.cameras is not None and self.path is not None:
             raise InputError(
                 f"`path` {self.path}: `cameras` gives the views already: leave one of them out"
-            )
-        if self.video.size is not None:
-            raise InputError(
-                f"`size`: the views of `cameras` {self.cameras} have sizes already: "
-                "leave `size` out"
             )
 
     def load(self) -> GivenPath:

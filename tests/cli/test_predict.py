@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from pathlib import Path
 
@@ -143,6 +144,39 @@ def test_cameras_completes_exactly_the_given_views(tmp_path: Path, pair: tuple[P
         assert np.abs(pixels(folder / "views" / f"{index:04d}.png") - drawn).max() < 2
         mask = pixels(folder / "views" / f"{index:04d}_mask.png")
         assert mask.mean() / 255 == pytest.approx(report["hole_area_ratio"][index]["before"])
+
+
+def test_a_file_of_another_program_that_names_the_photo_places_its_views_and_lens(
+    tmp_path: Path, pair: tuple[Path, Path]
+) -> None:
+    # nerfstudio: camera to world, x right, y up, z back. The photo stands at x = 5, turned by 90°
+    # about y; the other camera is 0.4 m to its right, which is along the world's -z.
+    turned = [[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
+    right = [[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, -0.4], [0, 0, 0, 1]]
+    height, width = pixels(pair[0]).shape[:2]
+    frames = [
+        {"file_path": "images/photo.png", "transform_matrix": turned},
+        {"file_path": "images/other.png", "transform_matrix": right},
+    ]
+    lens = {"w": 2 * width, "h": 2 * height, "fl_x": 2.4 * width, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(lens))
+    done = predicted(*pair, tmp_path / "out", "--cameras", tmp_path / "transforms.json")
+    assert "transforms.json: its lengths, in the scale of nerfstudio" in done.out + done.err
+    report = report_of(tmp_path / "out" / "photo")
+    assert report["focal_source"] == "cameras"
+    assert report["focal_px"] == pytest.approx(1.2 * width)
+    photo_view, side_view = report["hole_area_ratio"]
+    assert photo_view["before"] < 0.02 < 0.05 < side_view["before"]
+    # The same view in Spackle's own format shows the same.
+    views = tmp_path / "views.json"
+    K = [[2.4 * width, 0, width], [0, 2.4 * width, height], [0, 0, 1]]
+    pose = [[1, 0, 0, -0.4], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    own = {"frames": [{"K": K, "world_to_camera": pose, "width": 2 * width, "height": 2 * height}]}
+    views.write_text(json.dumps(own))
+    predicted(*pair, tmp_path / "own", "--cameras", views, "--focal-px", 1.2 * width)
+    drawn = pixels(tmp_path / "out" / "photo" / "views" / "0001_base.png").astype(float)
+    expected = pixels(tmp_path / "own" / "photo" / "views" / "0000_base.png").astype(float)
+    assert np.abs(drawn - expected).max() < 2
 
 
 def test_view_mode_completes_each_view_on_its_own(tmp_path: Path, pair: tuple[Path, Path]) -> None:

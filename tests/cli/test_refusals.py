@@ -33,7 +33,6 @@ BOTH = [
     ("--path good.json --disparity 0.2", "--disparity 0.2"),
     ("--path good.json --cameras views.json", "--cameras"),
     ("--cameras nowhere.json", "nowhere.json"),
-    ("--cameras views.json --size 64x48", "--size"),
     ("--cameras views.json --frames 9", "--frames 9"),
 ]
 PREDICT = [

@@ -5,6 +5,7 @@ projected by the other program's own mathematics, and by the cameras that are re
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import math
 import re
@@ -18,17 +19,22 @@ import pytest
 import torch
 from helpers.scenes import random_gaussians
 from PIL import Image
+from rich.console import Console
 
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import quat_from_matrix
 from spackle.core.photo import Photo
 from spackle.core.trajectories import DepthRange
-from spackle.formats import load_cameras
+from spackle.formats import load_cameras, save_ply
 from spackle.formats.camera_readers import camera_source_files, is_path_file, read_camera_set
 from spackle.formats.camera_set import CameraSet
 from spackle.formats.scene_content import SceneFile
+from spackle.render import CpuRenderer
+from spackle.results.saved_scene import render_scene
 from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Reporter
+from spackle.video.options import VideoOptions
 from spackle.views import GivenPath, PathOptions
 
 Array = np.ndarray[Any, Any]
@@ -399,8 +405,46 @@ def test_a_path_leads_through_cameras_of_another_program(tmp_path: Path) -> None
         np.testing.assert_allclose(pixels, one.pixels(world, FX, FX, **MIDDLE), atol=0.01)
 
 
+@pytest.mark.parametrize("size", [None, (160, 120)])
+def test_a_foreign_scene_is_rendered_from_its_own_cameras(
+    size: tuple[int, int] | None, tmp_path: Path
+) -> None:
+    one = POSES[2]
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = np.stack([one.right, one.down, one.forward])
+    world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ one.eye
+    before_camera = random_gaussians(200)
+    scene = before_camera.transform(torch.from_numpy(np.linalg.inv(world_to_camera)))
+    save_ply(scene, tmp_path / "point_cloud.ply")
+    path = PathOptions(
+        cameras=write(tmp_path / "cameras.json", inria()), video=VideoOptions(size=size)
+    )
+    said = io.StringIO()
+    render_scene(
+        tmp_path / "point_cloud.ply",
+        tmp_path / "out",
+        path,
+        Reporter(console=Console(file=said, width=300)),
+        device="cpu",
+    )
+    picture = np.asarray(Image.open(tmp_path / "out" / "0002.png"))
+    width, height = size or (WIDTH, HEIGHT)
+    scale = width / WIDTH
+    K = torch.tensor([[FX * scale, 0, width / 2], [0, FY * scale, height / 2], [0, 0, 1]])
+    expected = CpuRenderer().render(before_camera, Camera(K, torch.eye(4), width, height)).rgb
+    assert expected.std() > 0.1
+    np.testing.assert_allclose(picture / 255, expected, atol=0.02)
+    assert "its world is taken as that of point_cloud.ply" in said.getvalue()
+
+
 def bad_nerf(**lens: Any) -> dict[str, Any]:
     return {key: value for key, value in nerfstudio(**lens).items() if value is not None}
+
+
+def long_name() -> dict[str, Any]:
+    content = bad_nerf(w=None)
+    content["frames"][0]["file_path"] = "a" * 5000
+    return content
 
 
 def bad_pose() -> dict[str, Any]:
@@ -414,6 +458,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "fisheye of instant-ngp": (bad_nerf(is_fisheye=True), "a fisheye, not a pinhole"),
     "no focal length": (bad_nerf(fl_x=None, fl_y=None), "give fl_x or camera_angle_x"),
     "no size": (bad_nerf(w=None), "give w and h"),
+    "a name too long": (long_name(), "give w and h"),
     "half a pixel": (bad_nerf(w=320.5), "whole numbers"),
     "no rotation": (bad_pose(), "frame 1: the pose must be a rotation"),
     "a number too few": (

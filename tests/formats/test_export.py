@@ -329,6 +329,46 @@ def test_what_a_format_cannot_hold_is_said(scene: Path, tmp_path: Path) -> None:
         assert len(said.splitlines()) == (2 if says else 1)
 
 
+def with_factor(gaussians: Gaussians, factor: float) -> Gaussians:
+    """The scene in another unit."""
+    return dataclasses.replace(
+        gaussians, means=gaussians.means * factor, scales=gaussians.scales * factor
+    )
+
+
+@pytest.mark.parametrize(
+    ("parts", "suffix", "is_kept"),
+    [
+        ([1], "spz", True),
+        ([0.001], "spz", False),  # sizes below e^-10
+        ([0.001], "v4.spz", False),
+        ([1e-6], "spz", False),
+        ([1e5], "spz", False),  # sizes above e^5.94
+        ([0.001], "sog", True),
+        ([1e7], "sog", True),
+        ([0.001, 1000], "sog", False),  # steps of 0.2 mm near the origin
+        ([0.001, 1000], "compressed.ply", False),  # neighbours in the file share bounds
+        ([1e-6], "compressed.ply", True),
+        ([0.001, 1000], "splat", True),
+        ([0.001, 1000], "glb", True),
+    ],
+)
+def test_what_a_format_is_too_coarse_for_is_said(
+    scene: Path, parts: list[float], suffix: str, is_kept: bool
+) -> None:
+    base = BOX.base()
+    save_ply(Gaussians.cat(with_factor(base, factor) for factor in parts), scene)
+    said = export(scene, f"out.{suffix}")
+    assert ("get a wrong place or size" not in said) == is_kept
+    # The independent reader agrees: if nothing is said, Gaussians are where they were.
+    stored = read(suffix, (scene.parent / f"out.{suffix}").read_bytes())
+    original = in_file_order(suffix, load_ply(scene))
+    middle = original.scales.median(dim=1).values
+    moved = (stored.means - original.means).norm(dim=1) > middle
+    if is_kept:
+        assert not moved.any()
+
+
 REQUESTS = [
     ("scene.ply", ["a.spz", "a.obj"], r"a\.obj: which format"),
     ("text.ply", ["a.spz", "none/a.sog"], "not a PLY"),

@@ -400,11 +400,14 @@ def _whole(side: float | None, where: str) -> int:
 
 def _picture_size(path: Path, where: str) -> tuple[int, int]:
     """Return width and height of a picture; InputError if there is none."""
-    for suffix in PICTURE_SUFFIXES:
-        file = path.with_name(f"{path.name}{suffix}") if path.name else path
-        if file.is_file():
-            return read_image(file, _stored_size)
-    raise InputError(f"{where}: no size: give w and h, or put {path.name or 'the picture'} there")
+    advice = "give w and h, or put the picture there"
+    # A name may be too long for a file, or hold a zero.
+    with as_input_error(where, f"no size ({{reason}}): {advice}", OSError, ValueError):
+        for suffix in PICTURE_SUFFIXES:
+            file = path.with_name(f"{path.name}{suffix}") if path.name else path
+            if file.is_file():
+                return read_image(file, _stored_size)
+    raise InputError(f"{where}: no size: {advice}")
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from spackle.formats.gaussian_columns import Floats, GaussianColumns
@@ -63,12 +64,7 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
     Raises:
         ValueError: a Gaussian is not finite.
     """
-    columns = GaussianColumns.from_gaussians(scene.gaussians)
-    # If it is not known which Gaussians fill holes, all are sorted together.
-    base_count = 0 if scene.base_count is None else scene.base_count
-    base_order = morton_order(columns.means[:base_count])
-    fill_order = base_count + morton_order(columns.means[base_count:])
-    columns = columns.select(np.concatenate([base_order, fill_order]))
+    columns = GaussianColumns.from_gaussians(scene.gaussians).select(file_order(scene))
 
     chunks, vertices = _encode_tables(columns)
     header = ply_header(
@@ -79,6 +75,16 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
         disparity=scene.disparity,
     )
     return header + chunks.tobytes() + vertices.tobytes()
+
+
+def file_order(scene: SceneFile) -> NDArray[np.int64]:
+    """Return the indices [N] that bring a scene's Gaussians into the order of a compressed PLY."""
+    means = scene.gaussians.means.detach().to("cpu", torch.float32).numpy()
+    # If it is not known which Gaussians fill holes, all are sorted together.
+    base_count = 0 if scene.base_count is None else scene.base_count
+    base_order = morton_order(means[:base_count])
+    fill_order = base_count + morton_order(means[base_count:])
+    return np.concatenate([base_order, fill_order])
 
 
 def _encode_tables(columns: GaussianColumns) -> tuple[Floats, NDArray[np.uint32]]:

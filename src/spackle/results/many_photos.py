@@ -65,12 +65,12 @@ class PredictOptions:
                     raise InputError(
                         f"`{option}`: `no_render` writes no video: leave one of them out"
                     )
-        elif pipeline.given_path.cameras is not None:
+        elif pipeline.given_path.cameras is not None and path.video.size is None:
             problem = video_problem(pipeline.given_path.cameras.views())
             if problem:
                 raise InputError(
                     f"{path.cameras}: {problem}, so no video can be made: "
-                    "add `no_render` for pictures only"
+                    "give `size`, or add `no_render` for pictures only"
                 )
         return pipeline
 

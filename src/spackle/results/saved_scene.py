@@ -26,6 +26,7 @@ from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import Encoder, encoder_for, load_scene
 from spackle.formats.sog import META_NAME
 from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
+from spackle.formats.stored_precision import count_coarse
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio
 from spackle.runtime.errors import InputError, as_input_error
@@ -125,7 +126,7 @@ def render_scene(
     if problem and not makes_pictures:
         hint = "give `size`"
         if video.has_given_views:
-            hint = "give a folder with `output` for pictures only"
+            hint = "give `size`, or a folder with `output` for pictures only"
         raise InputError(
             f"{path.cameras or scene_file}: {problem}, so no video can be made: {hint}"
         )
@@ -348,7 +349,7 @@ def log_losses(scene: SceneFile, reporter: Reporter) -> None:
 
 
 def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Reporter) -> None:
-    """Log a line about a written file; for SPZ another about Gaussians beyond its grid, if any.
+    """Log a line about a written file, and others about Gaussians that its format cannot keep.
 
     `seconds` is the time that encoding and writing took.
     """
@@ -370,9 +371,15 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
             # The grid's step is 2 to the power of -fraction_bits.
             largest_coordinate = MAX_GRID_COORDINATE / 2**grid.fraction_bits
             reporter.log(
-                f"{output}: {moved_count:,} Gaussians beyond {largest_coordinate:,.0f} m were "
+                f"{output}: {moved_count:,} Gaussians beyond {largest_coordinate:,.4g} m were "
                 "moved nearer, which does not change the photo's view"
             )
+    coarse_count = count_coarse(scene, output)
+    if coarse_count:
+        reporter.log(
+            f"{output}: {coarse_count:,} of {count:,} Gaussians are too small or too close "
+            "together for this format, and get a wrong place or size: .ply and .glb keep them"
+        )
     reporter.result(
         {
             "file": output,
@@ -380,6 +387,7 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
             "bytes": size,
             "seconds": round(seconds, 3),
             "drawn_nearer": moved_count,
+            "coarse": coarse_count,
         }
     )
 
