@@ -31,11 +31,11 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from spackle.bases.lite import LiteBase
-from spackle.core.photo import PHOTO_SUFFIXES, load_photo
+from spackle.core.photo import load_photo
 from spackle.formats import save_png
 from spackle.formats.png import contact_sheet
 from spackle.paper.evaluation.datasets.stereo import pair_of_2014
-from spackle.paper.training.measured_photos import find_files
+from spackle.paper.training.measured_photos import find_photo_files
 from spackle.paper.training.recipe import RgbdFolder
 
 GUESSES = ("constant", "ramp", "lite")
@@ -83,7 +83,7 @@ def score(frame: Frame, guess: Tensor) -> DepthScore:
 
 def standing(base: LiteBase, photos: Path) -> str:
     """The table's line on synthetic streets with standing objects."""
-    draw = PhotoDraw(find_files(photos, "--standing", PHOTO_SUFFIXES, "photos"), print)
+    draw = PhotoDraw(find_photo_files(photos, "--standing"), print)
     scores: dict[str, list[StandingScore]] = {guess: [] for guess in GUESSES[1:]}
     for number in range(STREETS):
         frame, owner = labelled_scene(np.random.default_rng([STREETS_SEED, number]), draw, 320, 448)

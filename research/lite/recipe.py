@@ -13,8 +13,7 @@ from frames import Group, Measured, of_camera, of_scenes
 from pydantic import Field
 
 from spackle.bases.lite import SIDE_MULTIPLE, STAGES, EncoderSize
-from spackle.core.photo import PHOTO_SUFFIXES
-from spackle.paper.training.measured_photos import find_files
+from spackle.paper.training.measured_photos import find_photo_files
 from spackle.paper.training.recipe import (
     MAY_CHANGE_ON_RESUME,
     AnyRecipe,
@@ -124,11 +123,7 @@ class LiteFiles:
                 to validate with.
         """
         shares, groups = data.shares, []
-        photos = (
-            []
-            if data.photos is None
-            else find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
-        )
+        photos = [] if data.photos is None else find_photo_files(data.photos, "data.photos")
         stereo = [] if data.stereo is None else of_scenes(data.stereo, "data.stereo", right=True)
         rgbd: list[Measured] = []
         for camera in data.rgbd:

@@ -265,6 +265,8 @@ class Pipeline:
             warnings.append(line)
             reporter.warn(line)
 
+        for note in photo.notes:
+            warn(f"{name}: {note}")
         if photo.frame is not None:
             warn(f"{name}: {photo.frame.note}; `keep_frame` keeps it")
         prediction, base = self.base.predict(photo, log=warn_of_base, stage=reporter.stage)

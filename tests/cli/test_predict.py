@@ -390,3 +390,23 @@ def test_a_frame_is_cut_off_unless_geometry_is_given(tmp_path: Path) -> None:
     depth = write_depth(tmp_path / "a.npy", np.pad(metres(), ((6, 7), (3, 4)), constant_values=1))
     predicted(photo, depth, out, "--no-render")
     assert report_of(out / "a")["photo"] == whole
+
+
+def test_photos_of_any_suffix_in_a_folder_are_predicted_and_the_others_named(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    image = Image.fromarray(picture())
+    for name, kind in {"a.jfif": "JPEG", "b.bmp": "BMP", "c": "PNG"}.items():
+        image.save(folder / name, kind)
+    blue = Image.new("RGB", image.size, "blue")
+    image.save(folder / "d.gif", save_all=True, append_images=[blue])  # alone, it is a clip
+    (folder / "notes.txt").write_text("no photo")
+    (folder / "drawing.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n")
+    result = run("predict", folder, "-o", tmp_path / "out", "--no-render", "--disparity", "0.05")
+    assert result.code == 1
+    assert names_in(tmp_path / "out") >= {"a", "b", "c", "d"}
+    assert "1 file is no photo, and is left out: notes.txt" in result.err
+    assert "drawing.jpg: a PostScript file" in result.err
+    assert "d.gif: the file is animated, and its first picture is used" in result.err

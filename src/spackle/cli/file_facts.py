@@ -6,10 +6,11 @@ import math
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL.Image import DecompressionBombError
 
 from spackle.clips.files import is_clip, read_clip
 from spackle.core.camera import Camera
+from spackle.core.image_files import open_image
 from spackle.core.photo import load_photo
 from spackle.depth.depth_map import NEAR_AND_FAR_QUANTILES
 from spackle.depth.in_photo.layouts import load_photo_depth
@@ -47,9 +48,9 @@ def is_depth_map(path: Path) -> bool:
     if suffix != ".png":
         return suffix in DEPTH_SUFFIXES
     try:
-        with Image.open(path) as image:
+        with open_image(path, ("PNG",)) as image:
             return image.mode.startswith("I")  # Pillow's modes of whole numbers over 8 bits
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (OSError, ValueError, SyntaxError, DecompressionBombError):
         return False  # the reader of photos reports the error
 
 
@@ -144,5 +145,7 @@ def photo_facts(path: Path) -> FactsOfFile:
         facts["depth"] = "none inside"
     else:
         facts["depth"] = f"inside: {depth_map.note}; {depth_map.range_in_words}"
+    if photo.notes:
+        facts["note"] = "; ".join(photo.notes)
     facts["next"] = f"spackle predict {path} -o out; spackle view {path}"
     return facts

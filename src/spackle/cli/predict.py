@@ -284,16 +284,23 @@ def _predict_all(
     from spackle.runtime.files import check_file
     from spackle.runtime.folders import results_folder
 
-    photos = find_photos(sources)
-    clips = [photo for photo in photos if is_clip(photo.path)]
+    left_out: list[str] = []
+    photos = find_photos(sources, left_out.append)
+    # Of an animation in a folder of photos, the first picture is a photo like the others.
+    folders = {source for source in sources if source.is_dir()}
+    clips = [photo for photo in photos if photo.path.parent not in folders and is_clip(photo.path)]
     if not clips:
         # A folder with one photo is not a single photo: the next run may find more in it.
         is_single_photo = len(sources) == len(photos) == 1 and not sources[0].is_dir()
-        return predict_photos(photos, output, options, reporter, is_single=is_single_photo)
+        return predict_photos(
+            *(photos, output, options, reporter),
+            is_single=is_single_photo,
+            left_out=left_out,
+        )
 
     # A clip has options and results of its own, so it is not predicted together with photos.
     clip = clips[0]
-    if len(sources) > 1 or len(photos) > 1 or sources[0].is_dir():
+    if len(sources) > 1 or len(photos) > 1:
         raise InputError(f"{clip.path}: is a clip: give it alone, without other photos or clips")
 
     # `clip_options` refuses options that a clip cannot take.

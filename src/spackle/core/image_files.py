@@ -1,22 +1,45 @@
-"""Open image files that strangers made: limits of memory, orientation, transparency, colours.
+"""Open image files that strangers made: which decoder is tried, which picture, limits of memory.
 
-`read_image` opens a file; `upright`, `exif_tags` and `to_srgb_tensor` are for its callback.
+`read_picture` opens a photo; `read_image` gives Pillow's image of it alone. `srgb_pictures.py`
+turns it into colours.
 """
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import io
 import os
 import warnings
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO, TypeVar
 
-import numpy as np
 import pillow_heif
-import torch
-from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
-from torch import Tensor
+from PIL import Image, ImageOps, UnidentifiedImageError
 
+from spackle.core.heif_items import HeifItems
+from spackle.core.image_formats import (
+    AVIF,
+    EXPORT_ADVICE,
+    HEAD_BYTES,
+    HEIF,
+    JPEG,
+    RAW,
+    TIFF,
+    FileKind,
+    kind_of_bytes,
+    not_a_photo,
+)
+from spackle.core.raw_previews import RawFile, orientation_of, read_raw_file
+from spackle.core.tiff_directories import (
+    EXIF_DIRECTORY,
+    INTEROPERABILITY_DIRECTORY,
+    ORIENTATION,
+    SIDEWAYS_ORIENTATIONS,
+    read_directories,
+    tiff_from_directory,
+)
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 
@@ -29,11 +52,6 @@ MAX_PIXELS = 100_000_000  # a larger image would take more than a gigabyte as fl
 # must fit the file: a strongly compressed photo has 20 pixels for each byte.
 HARMLESS_PIXELS = 32_000_000
 MAX_PIXELS_PER_BYTE = 32
-
-MAX_UINT16 = 65535
-_ORIENTATION_TAG = 0x0112  # of EXIF
-_SIDEWAYS_ORIENTATIONS = (5, 6, 7, 8)  # with rows and columns swapped
-_EXIF_DIRECTORY = 0x8769  # the tag that points to the directory with the camera's settings
 
 
 class _BoundedFile(io.BufferedReader):
@@ -51,11 +69,54 @@ class _BoundedFile(io.BufferedReader):
         return super().read(min(size, remaining))
 
 
+def open_image(file: BinaryIO | Path, formats: tuple[str, ...]) -> Image.Image:
+    """The image of a file, with only its header read; all image files are opened here.
+
+    Pillow tries a decoder only if it is named. Of the others, some start programs: that of EPS runs
+    Ghostscript.
+
+    Args:
+        file: the open file, or its path.
+        formats: Pillow's names of the formats that the file may have.
+
+    Raises:
+        Exception: any of a decoder's; Pillow's UnidentifiedImageError for another format.
+    """
+    if not isinstance(file, Path):
+        file.seek(0)
+    return Image.open(file, formats=formats)
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenPicture:
+    """A photo's file that is open, with what it says about itself."""
+
+    image: Image.Image  # only the header is read
+    kind: FileKind  # of the picture; a raw file's is that of its preview
+    file: BinaryIO  # with the picture; a raw file's preview is a file of its own
+    exif: Mapping[int, object]  # by number
+    notes: tuple[str, ...]  # what the user should know, such as which of several pictures it is
+
+
 def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -> T:
     """Open an image file and return `read(image)`; the file is closed afterwards.
 
+    Of a raw file, the image is the preview inside.
+
     Raises:
         InputError: the file is missing, damaged, no image, or has more than 100 megapixels.
+    """
+    return read_picture(path, lambda picture: read(picture.image))
+
+
+def read_picture(path: str | os.PathLike[str], read: Callable[[OpenPicture], T]) -> T:
+    """Open a photo's file and return `read(picture)`; the file is closed afterwards.
+
+    The content decides which decoder is tried, and no other is.
+
+    Raises:
+        InputError: the file is missing, damaged, no photo, or has more than 100 megapixels; or it
+            is a raw file without a large preview.
     """
     check_file(path, "photo")
     with (
@@ -66,15 +127,110 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
         try:
             # A bounded file never allocates more than its size, whatever a broken image claims. It
             # has a buffer of its own, so the file below it needs none.
-            with _BoundedFile(open(path, "rb", buffering=0)) as file, Image.open(file) as image:
-                check_pixel_count(image.width, image.height, file.size, path)
-                return read(image)
+            with _BoundedFile(open(path, "rb", buffering=0)) as file:
+                kind = kind_of_bytes(file.read(HEAD_BYTES))
+                if not kind.is_photo:
+                    raise not_a_photo(path, kind)
+                raw_file = read_raw_file(file, kind) if kind in (TIFF, RAW) else None
+                if raw_file is not None:
+                    return _read_preview(path, raw_file, read)
+                with _open_picture(file, kind) as picture:
+                    check_pixel_count(picture.image.width, picture.image.height, file.size, path)
+                    return read(picture)
         except Image.DecompressionBombError:
             raise InputError(f"{path}: more than 100 megapixels: shrink the image first") from None
         except UnidentifiedImageError:
             raise InputError(
-                f"{path}: not an image of a known format: give a JPEG, PNG, WebP, HEIC or TIFF"
+                f"{path}: not an image of a known format, or damaged at its beginning: "
+                f"{EXPORT_ADVICE}"
             ) from None
+
+
+@contextlib.contextmanager
+def _open_picture(file: BinaryIO, kind: FileKind) -> Iterator[OpenPicture]:
+    """The photo in an open file, which is closed after the block."""
+    assert kind.pillow is not None  # the caller has refused all others
+    source = file
+    notes: tuple[str, ...] = ()
+    if kind is TIFF:
+        source, notes = _main_picture_of_tiff(file)
+    with open_image(source, (kind.pillow,)) as image:
+        exif = exif_tags(image)  # now: a TIFF loses its tags when its pixels are loaded
+        notes = notes or _notes_about_pictures(image, kind, source)
+        yield OpenPicture(image, kind, source, exif, notes)
+
+
+def _main_picture_of_tiff(file: BinaryIO) -> tuple[BinaryIO, tuple[str, ...]]:
+    """A TIFF whose first directory is the main picture, and what to say about others in the file.
+
+    It is the file itself, unless its first picture is marked as a thumbnail of a larger one.
+    """
+    directories = read_directories(file)
+    pages = [directory for directory in directories if directory.is_page]
+    notes: tuple[str, ...] = ()
+    if len(pages) > 1:
+        notes = (f"the file has {len(pages)} pictures, and the first one is used",)
+    if not pages or not directories[0].is_reduced:
+        return file, notes
+    return tiff_from_directory(file, pages[0]), notes
+
+
+def _notes_about_pictures(image: Image.Image, kind: FileKind, file: BinaryIO) -> tuple[str, ...]:
+    """A line that says which picture is used, if a file has several that are meant to be seen."""
+    if kind in (HEIF, AVIF):
+        file.seek(0)
+        items = HeifItems.of(file.read())
+        count = 1 if items is None else len(items.shown_pictures())
+        if count > 1:
+            return (f"the file has {count} pictures, and the main one is used",)
+        # A sequence has its frames elsewhere, and one picture that stands for them.
+        is_sequence = items is not None and items.has_movie
+        return ("the file is animated, and its still picture is used",) if is_sequence else ()
+    # The pictures behind the first one of a JPEG are previews, gain maps, or of a second lens.
+    if kind is not JPEG and getattr(image, "is_animated", False):
+        return ("the file is animated, and its first picture is used",)
+    return ()
+
+
+def _read_preview(
+    path: str | os.PathLike[str], raw_file: RawFile, read: Callable[[OpenPicture], T]
+) -> T:
+    """`read(picture)` of the largest preview of a raw file that can be decoded.
+
+    Raises:
+        InputError: there is no large one, or all of them are damaged.
+    """
+    problem: Exception | None = None
+    for preview in raw_file.usable_previews:
+        check_pixel_count(preview.width, preview.height, None, path)
+        note = (
+            "a raw file, of which the camera's preview of "
+            f"{preview.width}×{preview.height} pixels is used"
+        )
+        try:
+            with _open_picture(preview.open(), preview.kind) as picture:
+                _add_outer_tags(picture.image, raw_file.exif)
+                exif = {**raw_file.exif, **picture.exif}
+                return read(dataclasses.replace(picture, exif=exif, notes=(note,)))
+        except InputError:
+            raise
+        except Exception as error:  # damaged, or no preview but the sensor's data
+            problem = error
+
+    if problem is not None:
+        raise problem
+    what = "without a preview"
+    if raw_file.previews:
+        largest = raw_file.previews[0]
+        what = f"with a preview of {largest.width}×{largest.height} pixels only"
+    raise InputError(f"{path}: a raw file {what}: develop it, and export a JPEG")
+
+
+def _add_outer_tags(image: Image.Image, exif: Mapping[int, object]) -> None:
+    """Give a preview the orientation of its raw file, unless it has one of its own."""
+    tags = image.getexif()
+    if ORIENTATION not in tags:
+        tags[ORIENTATION] = orientation_of(exif)
 
 
 def check_pixel_count(
@@ -119,68 +275,21 @@ def upright_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     def read_size(image: Image.Image) -> tuple[int, int]:
         """The size of the turned image."""
         width, height = image.size
-        orientation = exif_tags(image).get(_ORIENTATION_TAG)
-        return (height, width) if orientation in _SIDEWAYS_ORIENTATIONS else (width, height)
+        is_sideways = exif_tags(image).get(ORIENTATION) in SIDEWAYS_ORIENTATIONS
+        # Pillow gives the size of a TIFF as it will be turned.
+        return (height, width) if is_sideways and image.format != "TIFF" else (width, height)
 
     return read_image(path, read_size)
 
 
 def exif_tags(image: Image.Image) -> dict[int, object]:
-    """All EXIF tags of an image, by number: of the image and of the camera; empty if broken."""
+    """All EXIF tags of an image, by number; empty if broken.
+
+    They are those of the image, of the camera, and of interoperability.
+    """
     try:
         exif = image.getexif()
-        return {**exif, **exif.get_ifd(_EXIF_DIRECTORY)}
+        camera = exif.get_ifd(EXIF_DIRECTORY)
+        return {**exif, **camera, **exif.get_ifd(INTEROPERABILITY_DIRECTORY)}
     except Exception:  # a stranger's EXIF can raise anything
         return {}
-
-
-def to_srgb_tensor(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
-    """Convert an image of any mode to [H, W, 3] float32 sRGB in 0..1; transparency becomes white.
-
-    Raises:
-        InputError: pixels of 32 bits, whose range is unknown; `path` is the name in the message.
-    """
-    is_deep_grey = image.mode in ("F", "I") or image.mode.startswith("I;16")  # over 8 bits
-    if is_deep_grey:
-        return _deep_grey_to_tensor(image, path)
-
-    # The colour profile is fetched now, because converting the mode loses it.
-    profile = image.info.get("icc_profile")
-    if image.has_transparency_data:
-        image = image.convert("RGBA")
-        white = Image.new("RGBA", image.size, "white")
-        image = Image.alpha_composite(white, image).convert("RGB")
-    elif image.mode not in ("RGB", "L", "CMYK"):
-        # Those three modes stay until the profile is applied, because it describes them.
-        image = image.convert("RGB")
-    image = _apply_colour_profile(image, profile).convert("RGB")
-    return torch.from_numpy(np.array(image)).float().div_(255)
-
-
-def _deep_grey_to_tensor(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
-    """Convert a grey image of 16 bits to [H, W, 3] float32 in 0..1; InputError for 32 bits."""
-    values = np.asarray(image)  # [H, W]
-    # Pillow opens some images of 16 bits in the mode of 32 bits, so the values decide.
-    is_32_bit = image.mode == "F" or values.min() < 0 or values.max() > MAX_UINT16
-    if is_32_bit:
-        raise InputError(f"{path}: pixels of 32 bits: save the photo with 8 or 16 bits per channel")
-    grey = torch.from_numpy(values.astype(np.float32)).div_(MAX_UINT16)
-    return grey[..., None].expand(-1, -1, 3).contiguous()
-
-
-def _apply_colour_profile(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Convert an image from its embedded ICC profile to sRGB.
-
-    Without a profile, or with one that is broken or made for another mode, the image is unchanged.
-    """
-    if not profile:
-        return image
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if "sRGB" in ImageCms.getProfileDescription(source):
-            return image
-        target = ImageCms.createProfile("sRGB")
-        converted = ImageCms.profileToProfile(image, source, target, outputMode="RGB")
-        return converted or image  # never None here, but Pillow's types allow it
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
-        return image

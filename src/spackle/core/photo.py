@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +20,18 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource, resolve_focal_length
-from spackle.core.image_files import (
-    check_pixel_count,
-    exif_tags,
-    read_image,
-    to_srgb_tensor,
-    upright,
-)
+from spackle.core.image_files import OpenPicture, check_pixel_count, exif_tags, read_picture
 from spackle.core.photo_frame import PhotoFrame, find_frame
+from spackle.core.projections import looks_like_360, refuse_other_projections, xmp_of_image
+from spackle.core.srgb_pictures import SrgbPicture, image_to_srgb, picture_to_srgb
+from spackle.core.stated_colors import read_stated_colors
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.errors import InputError, as_input_error, short_repr
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")
 MIN_SIDE_PX = 32  # a smaller photo shows no scene
 MAX_ASPECT_RATIO = 8  # long to short side; a narrower photo shows no scene
 MAX_WORKING_SIDE_PX = 1536  # long side of a photo at the size at which Spackle works
+MAYBE_360_NOTE = "looks like a 360° panorama, whose scene would be bent: cut a flat view out of it"
 REPLACED_BORDER_RATIO = 0.005  # width of the border that `replace_border` replaces, per long side
 
 
@@ -46,6 +44,8 @@ class Photo:
     focal_source: FocalSource
     path: Path
     frame: PhotoFrame | None = None  # the border that was cropped, in pixels of `rgb`
+    # What the user should know: which of several pictures it is, what was guessed of its colours.
+    notes: tuple[str, ...] = ()
 
     @property
     def height(self) -> int:
@@ -85,12 +85,13 @@ def load_photo(
     fov: float | None = None,
     keep_frame: bool = True,
 ) -> Photo:
-    """Read a JPEG, PNG, WebP, HEIC, TIFF or any other image that Pillow opens.
+    """Read a JPEG, PNG, WebP, HEIC, AVIF, TIFF, GIF, BMP or PNM, or the preview of a raw file.
 
-    The photo is turned upright as EXIF asks, and converted to sRGB from an embedded profile.
-    Transparent pixels become white. Only the first frame of an animation is read. Without
-    `focal_px`, `focal_mm` and `fov`, the focal length comes from EXIF; a photo without EXIF gets a
-    35 mm equivalent of 30 mm.
+    The photo is turned upright as EXIF asks, and converted to sRGB from the colours that the file
+    states; HDR is mapped to the range of sRGB. Transparent pixels become white. Of several
+    pictures, the main one is read, and of an animation the first; `notes` of the result says so.
+    Without `focal_px`, `focal_mm` and `fov`, the focal length comes from EXIF; a photo without EXIF
+    gets a 35 mm equivalent of 30 mm.
 
     Args:
         path: the file.
@@ -102,19 +103,32 @@ def load_photo(
             unless a focal length is given, because that holds for the whole photo.
 
     Raises:
-        InputError: the file is missing, broken or too large, or the focal length is invalid.
+        InputError: the file is missing, broken or too large, the picture is a panorama or a
+            fisheye, or the focal length is invalid.
     """
 
-    def read(image: Image.Image) -> tuple[Tensor, dict[int, object]]:
-        """The pixels as sRGB [H, W, 3], and the EXIF tags."""
-        tags = exif_tags(image)  # first: a TIFF loses its tags when its pixels are loaded
-        image.load()
-        return to_srgb_tensor(upright(image), path), tags
+    def read(picture: OpenPicture) -> Photo:
+        """The photo of an open file."""
+        refuse_if_not_flat(picture, path)
+        colors = picture_to_srgb(picture, path)
+        return _make_photo(
+            dataclasses.replace(colors, notes=(*picture.notes, *colors.notes)),
+            picture.exif,
+            Path(path),
+            keep_frame,
+            focal_px=focal_px,
+            focal_mm=focal_mm,
+            fov=fov,
+        )
 
-    rgb, exif = read_image(path, read)
-    return _make_photo(
-        rgb, exif, Path(path), keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov
-    )
+    return read_picture(path, read)
+
+
+def refuse_if_not_flat(picture: OpenPicture, path: str | os.PathLike[str]) -> None:
+    """Raise an InputError for a 360° photo, a panorama or a fisheye; `path` is its file."""
+    image = picture.image
+    xmp = xmp_of_image(image, picture.exif)
+    refuse_other_projections(path, picture.exif, xmp, image.width, image.height)
 
 
 def photo_from_picture(
@@ -131,18 +145,21 @@ def photo_from_picture(
         focal_options: at most one of `focal_px`, `focal_mm` and `fov`, as in `load_photo`.
 
     Raises:
-        InputError: the picture has another shape, type or range, or the focal length is invalid.
+        InputError: the picture has another shape, type or range, is a panorama or a fisheye, or the
+            focal length is invalid.
     """
     name = Path("photo")  # for messages, because a picture has no file
+    exif: Mapping[int, object] = {}
     if isinstance(picture, Image.Image):
         check_pixel_count(picture.width, picture.height, file_bytes=None, path=name)
         exif = exif_tags(picture)
+        xmp = xmp_of_image(picture, exif)
+        refuse_other_projections(name, exif, xmp, picture.width, picture.height)
         with as_input_error(name, "the picture cannot be used: {reason}"):
-            rgb = to_srgb_tensor(upright(picture), name)
+            colors = image_to_srgb(picture, read_stated_colors(picture, exif), exif, name)
     else:
-        exif = {}
-        rgb = _array_to_rgb(picture, name)
-    return _make_photo(rgb, exif, name, keep_frame, **focal_options)
+        colors = SrgbPicture(_array_to_rgb(picture, name), ())
+    return _make_photo(colors, exif, name, keep_frame, **focal_options)
 
 
 def _array_to_rgb(picture: NDArray[Any] | Tensor, name: Path) -> Tensor:
@@ -182,8 +199,8 @@ def _array_to_rgb(picture: NDArray[Any] | Tensor, name: Path) -> Tensor:
 
 
 def _make_photo(
-    rgb: Tensor,
-    exif: dict[int, object],
+    picture: SrgbPicture,
+    exif: Mapping[int, object],
     path: Path,
     keep_frame: bool,
     **focal_options: float | None,
@@ -191,15 +208,19 @@ def _make_photo(
     """A photo of an upright image, without its uniform border unless `keep_frame`.
 
     Args:
-        rgb: [H, W, 3] float32 sRGB in 0..1.
+        picture: the upright image.
         exif: the image's EXIF tags, by number.
         path: the image's file.
         keep_frame: keep a uniform border.
         focal_options: at most one of `focal_px`, `focal_mm` and `fov`; InputError for an
             impossible one.
     """
+    rgb = picture.rgb
     height, width = rgb.shape[:2]
     focal, source = resolve_focal_length(path, width, height, exif, **focal_options)
+    notes = picture.notes
+    if looks_like_360(rgb):
+        notes += (MAYBE_360_NOTE,)
 
     # A user's focal length or field of view holds for the whole image, so it is not cropped.
     frame = None
@@ -207,7 +228,7 @@ def _make_photo(
         frame = find_frame(rgb)
     if frame is not None:
         rgb = frame.inside(rgb, width, height)
-    return Photo(rgb, focal, source, path, frame)
+    return Photo(rgb, focal, source, path, frame, notes)
 
 
 def check_photo_size(width: int, height: int, path: str | os.PathLike[str]) -> None:

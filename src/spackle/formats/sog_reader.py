@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from spackle.core.image_files import open_image
 from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
 from spackle.formats.quantization import (
     codes_to_fractions,
@@ -198,8 +198,7 @@ def _read_images(read_member: ReadMember, names: list[str], count: int) -> list[
     images = []
     for name in names:
         content = io.BytesIO(read_member(name))
-        # No others, so that a stranger's file cannot reach the decoders of rare formats.
-        with Image.open(content, formats=["WEBP", "PNG"]) as image:
+        with open_image(content, ("WEBP", "PNG")) as image:
             pixel_count = image.width * image.height
             if max(image.size) > MAX_IMAGE_SIDE_PX or not 0 < count <= pixel_count:
                 size = f"{image.width}×{image.height}"

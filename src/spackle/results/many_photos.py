@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import spackle
 from spackle.bases.open import BaseError
-from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.core.image_formats import list_photos
 from spackle.depth.calibration import calibration_candidates
 from spackle.depth.readers import find_depth_file
 from spackle.depth.writers import check_depth_name
@@ -34,7 +34,7 @@ from spackle.results.photo_folder import (
 from spackle.runtime.device import thread_count
 from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import check_file, list_files
+from spackle.runtime.files import check_file
 from spackle.runtime.folders import results_folder
 from spackle.runtime.kernels import is_compiled
 from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
@@ -113,18 +113,24 @@ def say_if_kernels_compile(pipeline: Pipeline, reporter: Reporter) -> None:
         )
 
 
-def find_photos(sources: Sequence[Path]) -> list[NamedPhoto]:
+def find_photos(
+    sources: Sequence[Path], log: Callable[[str], None] | None = None
+) -> list[NamedPhoto]:
     """The photos that are given by name, by a pattern such as "*.png", or by folder.
 
     The folder of a photo's results is named by the photo's file without the suffix, or with the
     suffix if another photo has the same name without it.
+
+    Args:
+        sources: names, patterns and folders.
+        log: receives a line that names and counts the files of a folder that are no photos.
 
     Raises:
         InputError: a folder without photos, or two photos whose results would have the same name.
     """
     photos: list[Path] = []
     for source in sources:
-        photos += _photos_of(source)
+        photos += _photos_of(source, log)
 
     # Names that differ only in upper and lower case count as equal, because the file systems of
     # Windows and macOS do not distinguish them.
@@ -144,17 +150,15 @@ def find_photos(sources: Sequence[Path]) -> list[NamedPhoto]:
     return list(named.values())
 
 
-def _photos_of(source: Path) -> list[Path]:
+def _photos_of(source: Path, log: Callable[[str], None] | None) -> list[Path]:
     """The photos in a folder, or those that match a pattern, or the file itself.
 
-    InputError for a folder without photos.
+    `log` receives a line about other files of the folder. InputError for a folder without photos.
     """
     if os.path.isdir(source):
-        photos = list_files(source, PHOTO_SUFFIXES)
+        photos = list_photos(source, log=log)
         if not photos:
-            raise InputError(
-                f"{source}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})"
-            )
+            raise InputError(f"{source}: no photos in this folder: give another one")
         return photos
 
     # Not every shell replaces a pattern by names. If a file has just this name, such as "a[1].png",
@@ -175,6 +179,7 @@ def predict_photos(
     reporter: Reporter,
     *,
     is_single: bool,
+    left_out: Sequence[str] = (),
 ) -> int:
     """Predict photos into the folder `output`, each into a folder of its name.
 
@@ -185,6 +190,8 @@ def predict_photos(
         reporter: gets messages, progress and results.
         is_single: whether one photo was named, not a folder; it is predicted even if its results
             exist, and its error ends the run.
+        left_out: lines about files of the folders that are no photos, which are logged once
+            nothing stands in the way of the run.
 
     Returns:
         The number of photos that failed.
@@ -203,6 +210,8 @@ def predict_photos(
     # so that several may be predicted at once.
     shared_digest = _shared_digest(options)
     with results_folder(output, locked=not is_single):
+        for line in left_out:
+            reporter.log(line)
         predictor = Predictor(
             output=output,
             options=options,

@@ -24,7 +24,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import spackle
 from spackle.bases.settings import AUTO
-from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.core.image_formats import PHOTO_SUFFIXES
 from spackle.formats.html import read_page_file
 from spackle.runtime.task_process import TaskFunction
 from spackle.web.guard import MAX_UPLOAD_BYTES, Access, Guard

@@ -12,13 +12,24 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 
 from spackle.bases.settings import MISSING_WEIGHTS_ADVICE
-from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.core.image_formats import (
+    HEAD_BYTES,
+    PHOTO_SUFFIXES,
+    FileKind,
+    kind_of_bytes,
+    not_a_photo,
+)
 from spackle.depth.readers import DEPTH_SUFFIXES
 from spackle.runtime.errors import InputError, first_validation_problem, printable_line
 from spackle.web.jobs import Job, Jobs
 from spackle.web.work import PREVIEW, SceneOptions, check_photo
 
 MAX_NAME_CHARACTERS = 80
+DEPTH_NAME = "depth map"  # what messages call an uploaded depth map
+PHOTO_DESCRIPTION = (
+    "A photo; its content decides, not its name. The usual names end in "
+    f"{', '.join(PHOTO_SUFFIXES)}."
+)
 BINARY_FILE = {"type": "string", "format": "binary"}
 # The form in the description of the HTTP interface. It is not declared as a parameter, because
 # FastAPI would then read it before the queue has a place.
@@ -27,7 +38,7 @@ UPLOAD_FORM: dict[str, Any] = {
         "type": "object",
         "required": ["photo"],
         "properties": {
-            "photo": {**BINARY_FILE, "description": f"One of {', '.join(PHOTO_SUFFIXES)}."},
+            "photo": {**BINARY_FILE, "description": PHOTO_DESCRIPTION},
             "depth": {
                 **BINARY_FILE,
                 "description": f"Its depth map, one of {', '.join(DEPTH_SUFFIXES)}.",
@@ -64,14 +75,14 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
     photo_name = safe_display_name(photo.filename or "")
     options = read_options(options_text, bases)
 
-    photo_file = store_upload(photo, upload_folder, "source", photo_name, PHOTO_SUFFIXES)
+    photo_file = store_upload(photo, upload_folder, f"source{photo_suffix(photo, photo_name)}")
     depth = form.get("depth")
     depth_file = None
     # A browser sends an empty field without a name if no file was chosen.
     if isinstance(depth, UploadFile) and depth.filename:
-        depth_file = store_upload(depth, upload_folder, "depth", "depth map", DEPTH_SUFFIXES)
+        depth_file = store_upload(depth, upload_folder, f"depth{depth_suffix(depth)}")
 
-    # Only decoding shows whether a file is a photo; its suffix proves nothing.
+    # Only decoding shows whether a photo is whole.
     try:
         check_photo(upload_folder / photo_file, photo_name, upload_folder / PREVIEW)
     except InputError as error:
@@ -106,34 +117,50 @@ def read_options(text: str, bases: list[str]) -> SceneOptions:
     return options
 
 
-def store_upload(
-    upload: UploadFile, folder: Path, stem: str, shown_name: str, suffixes: tuple[str, ...]
-) -> str:
-    """Store an uploaded file under a name that the client cannot choose; returns this name.
+def photo_suffix(upload: UploadFile, shown_name: str) -> str:
+    """The usual suffix of the format that an uploaded photo has by its content, such as ".jpg".
 
-    Args:
-        upload: the file.
-        folder: where to store it.
-        stem: its new name without the suffix, which comes from the client.
-        shown_name: what messages call the file.
-        suffixes: accepted suffixes, such as ".jpg".
-
-    Raises:
-        HTTPException: 415 for another suffix, 400 for an empty file.
+    HTTPException: 415 for a file that is no photo, 400 for an empty file.
     """
+    kind = _kind_of_upload(upload, shown_name)
+    if not kind.is_photo:
+        raise HTTPException(415, str(not_a_photo(shown_name, kind)))
+    return kind.suffixes[0]
+
+
+def depth_suffix(upload: UploadFile) -> str:
+    """The suffix under which an uploaded depth map is stored.
+
+    HTTPException: 415 for a file that is neither a depth map nor a picture, which holds relative
+    depth; 400 for an empty file.
+    """
+    kind = _kind_of_upload(upload, DEPTH_NAME)
     suffix = PurePosixPath(upload.filename or "").suffix.lower()
-    if suffix not in suffixes:
-        raise HTTPException(
-            415, f"{shown_name}: this kind of file is not accepted: give {', '.join(suffixes)}"
-        )
+    if suffix in DEPTH_SUFFIXES:
+        return suffix
+    if kind.is_photo:
+        return kind.suffixes[0]
+    raise HTTPException(
+        415, f"{DEPTH_NAME}: this kind of file is not accepted: give {', '.join(DEPTH_SUFFIXES)}"
+    )
+
+
+def _kind_of_upload(upload: UploadFile, shown_name: str) -> FileKind:
+    """The format of an uploaded file by its first bytes; HTTPException 400 for an empty file."""
     if not upload.size:
         raise HTTPException(400, f"{shown_name}: the file is empty")
+    upload.file.seek(0)
+    head = upload.file.read(HEAD_BYTES)
+    upload.file.seek(0)
+    return kind_of_bytes(head)
 
+
+def store_upload(upload: UploadFile, folder: Path, name: str) -> str:
+    """Store an uploaded file in a folder as `name`, which the client cannot choose; returns it."""
     # "x" refuses to overwrite: the folder is new, so nothing can have this name.
-    stored_name = f"{stem}{suffix}"
-    with (folder / stored_name).open("xb") as file:
+    with (folder / name).open("xb") as file:
         shutil.copyfileobj(upload.file, file)
-    return stored_name
+    return name
 
 
 def safe_display_name(file_name: str) -> str:

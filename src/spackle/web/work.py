@@ -10,14 +10,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from PIL import Image, ImageOps
+from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, ROUGH_GEOMETRY_ADVICE, BaseSettings
-from spackle.core.image_files import read_image
-from spackle.core.photo import PHOTO_SUFFIXES, check_photo_size
+from spackle.core.color import to_uint8
+from spackle.core.image_files import OpenPicture, read_picture
+from spackle.core.photo import check_photo_size, refuse_if_not_flat
+from spackle.core.srgb_pictures import picture_to_srgb
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import DepthKind
 from spackle.formats.html import html_safe_json, single_html
@@ -58,8 +60,6 @@ SCENE_FILE = "scene.ply"  # the scene, of which all other files are made
 PAGE = "page.json"  # what the page draws, without the Gaussians
 PREVIEW = "photo.jpg"  # the small photo that the page shows until the scene is ready
 PREVIEW_SIDE_PX = 1280  # pixels of the preview's long side
-# The formats that Pillow may decode: for EPS, for example, Pillow would start another program.
-PILLOW_FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
 
 
 class SceneOptions(BaseModel):
@@ -290,20 +290,18 @@ def check_photo(path: Path, name: str, preview: Path) -> None:
         InputError: the file is no photo of an accepted format, or too small or too large.
     """
 
-    def write_preview(image: Image.Image) -> None:
-        """Check the photo at `path`, which Pillow has opened, and write the small JPEG, upright.
+    def write_preview(picture: OpenPicture) -> None:
+        """Check the photo at `path`, which is open, and write the small JPEG, upright and in sRGB.
 
         `path` and `preview` are arguments of `check_photo`.
         """
-        if image.format not in PILLOW_FORMATS:
-            raise InputError(f"{path}: a {image.format} picture: give {', '.join(PHOTO_SUFFIXES)}")
-        check_photo_size(image.width, image.height, path)
-        image.load()  # decodes all pixels, and so finds damage
-        upright = ImageOps.exif_transpose(image)  # cameras note in EXIF how they were held
-        upright.thumbnail((PREVIEW_SIDE_PX, PREVIEW_SIDE_PX))
-        upright.convert("RGB").save(preview, quality=85)
+        refuse_if_not_flat(picture, path)
+        check_photo_size(picture.image.width, picture.image.height, path)
+        # Decodes all pixels, and so finds damage.
+        small = picture_to_srgb(picture, path, max_side=PREVIEW_SIDE_PX)
+        Image.fromarray(to_uint8(small.rgb).numpy()).save(preview, quality=85)
 
     try:
-        read_image(path, write_preview)
+        read_picture(path, write_preview)
     except InputError as error:
         raise InputError(str(error).replace(str(path), name)) from error

@@ -1,4 +1,4 @@
 """The depth map inside a portrait photo: Apple's and Android's, in HEIC and JPEG.
 
-`layouts.load_photo_depth` is the entry; `containers` takes files, boxes and XMP packets apart.
+`layouts.load_photo_depth` is the entry.
 """

@@ -20,21 +20,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import torch
-from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 from torch import Tensor
 
-from spackle.core.image_files import check_pixel_count
-from spackle.depth.depth_map import (
-    Array,
-    DepthMap,
-    Quantity,
-    StrPath,
-    is_valid_depth,
-    quantisation_step,
-)
-from spackle.depth.in_photo.containers import (
-    STEPS_OF_EXIF_ORIENTATION,
+from spackle.core.heif_items import STEPS_OF_EXIF_ORIENTATION, steps_of_depth_item
+from spackle.core.image_files import check_pixel_count, open_image
+from spackle.core.photo_containers import (
     extended_xmp_of,
     find_number,
     find_property,
@@ -42,9 +33,16 @@ from spackle.depth.in_photo.containers import (
     open_jpeg,
     own_property,
     parse_xmp,
-    steps_of_depth_item,
     xmp_of,
     xmp_packets,
+)
+from spackle.depth.depth_map import (
+    Array,
+    DepthMap,
+    Quantity,
+    StrPath,
+    is_valid_depth,
+    quantisation_step,
 )
 from spackle.runtime.errors import InputError, reason_in_a_line
 from spackle.runtime.files import check_file
@@ -193,7 +191,7 @@ def _factor_to_plausible(depth: Tensor) -> float:
 
 def _read_codes(picture: bytes) -> tuple[Array, int]:
     """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
-    with Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
+    with open_image(io.BytesIO(picture), ("JPEG", "PNG")) as image:
         width, height = image.size
         check_pixel_count(width, height, len(picture), "the map")
         if image.mode.startswith("I"):  # 16 bits

@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 
 from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
-from spackle.core.image_files import check_pixel_count
+from spackle.core.image_files import check_pixel_count, open_image
 
 PNG_COMPRESSION_LEVEL = 1  # level 6 takes three times as long and saves a tenth of the bytes
 MAX_CODE = 65535  # the greatest number of 16 bits
@@ -172,8 +172,7 @@ def decode_png(data: bytes, axis_count: int) -> NDArray[Any]:
     ValueError or an exception of Pillow if the picture has another number of axes, is damaged, or
     claims more pixels than so few bytes can hold.
     """
-    # No other format: Pillow has decoders for many, and some start other programs.
-    with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+    with open_image(io.BytesIO(data), ("PNG",)) as image:
         check_pixel_count(*image.size, len(data), "a picture")
         pixels = np.array(image)
     if pixels.ndim != axis_count:

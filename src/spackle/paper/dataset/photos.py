@@ -10,13 +10,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from spackle.core.photo import PHOTO_SUFFIXES, load_photo
+from spackle.core.image_formats import list_photos
+from spackle.core.photo import load_photo
 from spackle.runtime.digests import sha256_of
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import list_files
 from spackle.runtime.progress import Progress
 
-DATASET_PHOTO_SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
 MIN_SIDE_PX = 32  # no depth can be recognised in smaller images
 MAX_SHOWN_CHARACTERS = 60  # of a bad name, in a message
 
@@ -45,7 +44,8 @@ def find_photos(
         source: a folder, whose subfolders are included, or a COCO file, a list of photos as
             `{"images": [{"file_name": …}, …]}`.
         folder: the folder of the COCO file's photos; None: the file's own folder.
-        log: receives a line if photos that the COCO file names are missing.
+        log: receives a line about files of the folder that are no photos, and one if photos that
+            the COCO file names are missing.
 
     Returns:
         The folder, and the photos' sorted names relative to the folder.
@@ -56,11 +56,9 @@ def find_photos(
     # Whatever is no folder must be a list of photos.
     if not os.path.isdir(source):
         return find_coco_photos(source, folder, log)
-    files = list_files(source, DATASET_PHOTO_SUFFIXES, below=True)
+    files = list_photos(source, below=True, log=log)
     if not files:
-        raise InputError(
-            f"{source}: no photos in this folder (looked for {', '.join(DATASET_PHOTO_SUFFIXES)})"
-        )
+        raise InputError(f"{source}: no photos in this folder: give another one")
     return source, sorted(file.relative_to(source).as_posix() for file in files)
 
 

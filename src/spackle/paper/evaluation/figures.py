@@ -12,6 +12,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch.nn.functional import avg_pool2d
 
+from spackle.core.image_files import open_image
 from spackle.paper.evaluation.folder import load_run
 from spackle.paper.evaluation.measurements import Run
 from spackle.paper.evaluation.method_descriptions import METHODS
@@ -236,7 +237,7 @@ def _figure_row(
         image: the image's name.
     """
     files = stored_pictures(run, folder, image)
-    pictures = {name: Image.open(path).convert("RGB") for name, path in files.items()}
+    pictures = {name: open_image(path, ("PNG",)).convert("RGB") for name, path in files.items()}
     shows_hole = HOLE_PICTURE in figure.columns
 
     row = []

@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from spackle.core.color import to_uint8
+from spackle.core.image_files import open_image
 from spackle.formats.png import thumbnail
 from spackle.paper.evaluation.folder import image_file
 from spackle.paper.evaluation.measurements import Run
@@ -341,7 +342,7 @@ def _contact_sheet_row(
     # The stored pictures are those of this view.
     setting, view = run.view_with_largest_hole(image)
     files = stored_pictures(run, folder, image)
-    pictures = [GridPicture(Image.open(files[name]).convert("RGB")) for name in names]
+    pictures = [GridPicture(open_image(files[name], ("PNG",)).convert("RGB")) for name in names]
     return GridRow(f"{image}, {setting} {view}: {value:.4g}", pictures)
 
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 from jinja2 import Environment
 from markupsafe import Markup, escape
-from PIL import Image
 
+from spackle.core.image_files import open_image
 from spackle.paper.evaluation.measurements import (
     REMARK_METRIC,
     Measurement,
@@ -278,7 +278,7 @@ def _report_image(run: Run, name: str, position: str, files: Mapping[str, Path])
     # All pictures of a slider have the same size, because they show one view.
     names = list(files)
     left, right = _first_slider_pictures(names)
-    with Image.open(files[left]) as image:
+    with open_image(files[left], ("PNG",)) as image:
         width, height = image.size
 
     return ReportImage(

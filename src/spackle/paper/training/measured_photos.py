@@ -12,6 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from spackle.core.camera import Camera
+from spackle.core.image_formats import list_photos
 from spackle.core.photo import load_photo
 from spackle.depth.calibration import read_calibration
 from spackle.depth.depth_map import DepthMap
@@ -48,6 +49,21 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], description: st
     if not files:
         raise InputError(f"{folder}: contains no {description}: set {key} to another folder")
     return files
+
+
+def find_photo_files(folder: Path, key: str) -> list[Path]:
+    """All photos below a folder, told by their content, sorted; InputError if there are none.
+
+    Args:
+        folder: where to look, its subfolders included.
+        key: the recipe's key that names the folder, such as "data.photos", for messages.
+    """
+    if not os.path.isdir(folder):
+        raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
+    photos = list_photos(folder, below=True)
+    if not photos:
+        raise InputError(f"{folder}: contains no photos: set {key} to another folder")
+    return photos
 
 
 def pick_random(rng: np.random.Generator, files: Sequence[Path]) -> Path:

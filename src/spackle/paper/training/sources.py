@@ -21,7 +21,6 @@ from spackle.bases import BasePrediction
 from spackle.bases.depth import lift_rgbd
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory_cameras
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.dataset.shards import DatasetFiles
@@ -30,6 +29,7 @@ from spackle.paper.training.measured_photos import (
     draw_left_photo,
     draw_rgbd_frame,
     find_files,
+    find_photo_files,
     load_pair,
     pick_random,
 )
@@ -91,7 +91,7 @@ def composite_source(data: DataRecipe, folder: Path, renderer: Renderer) -> Sour
     Cut-outs of photos stand in front of other photos, at random depths. Of such a composite, the
     holes are what a virtual camera does not see, and the composite itself is the target.
     """
-    photos = find_files(folder, "data.photos", PHOTO_SUFFIXES, "photos")
+    photos = find_photo_files(folder, "data.photos")
     draw = partial(draw_composite, photos=photos)
     return Source(
         share=data.shares.composites,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.core.image_formats import list_photos
 from spackle.depth.calibration import Calibration, read_short_text
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.readers import read_array
@@ -21,7 +21,6 @@ from spackle.paper.evaluation.datasets.stereo import (
     with_origin_at_corner,
 )
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import list_files
 
 MM_PER_M = 1000
 
@@ -54,7 +53,7 @@ def _cases_of_scene(folder: Path) -> list[Case]:
     """
     # The left camera is number 00, the right one 02. All left photos have one size, which is read
     # from the first photo that is not damaged.
-    left_photos = list_files(folder / "camera_00", PHOTO_SUFFIXES)
+    left_photos = list_photos(folder / "camera_00")
     size = size_of_photos(left_photos)
     calibration = _read_opencv_calibration(folder / "calib_00-02.xml")
     disparity_path = folder / "disp_00.npy"

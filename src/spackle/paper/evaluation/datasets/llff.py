@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
-from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.core.image_formats import list_photos
 from spackle.formats.colmap import model_folder
 from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.datasets.colmap import read_model
@@ -24,7 +24,6 @@ from spackle.paper.evaluation.datasets.multiview import (
     posed_photos_of_model,
 )
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import list_files
 
 PHOTO_FOLDERS = ("images_4", "images", "images_8")  # the first of these with photos is used
 
@@ -105,7 +104,7 @@ def _photo_files(folder: Path) -> list[Path]:
     """The photos of a scene, sorted by name, from the first folder that has any."""
     for name in PHOTO_FOLDERS:
         if (folder / name).is_dir():
-            files = list_files(folder / name, PHOTO_SUFFIXES)
+            files = list_photos(folder / name)
             if files:
                 return files
     return []

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.core.image_formats import PHOTO_SUFFIXES, list_photos
 from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.datasets.dataset import EvalDataset
-from spackle.runtime.files import list_files
 
 
 def photo_cases(scenes: Mapping[str, Path]) -> list[Case]:
@@ -26,7 +25,7 @@ def photo_cases(scenes: Mapping[str, Path]) -> list[Case]:
     return [
         Case(name=f"{name}/{file.stem}", photo=file)
         for name, folder in scenes.items()
-        for file in list_files(folder, PHOTO_SUFFIXES)
+        for file in list_photos(folder)
     ]
 
 

@@ -1,0 +1,159 @@
+"""ICC profiles: by LittleCMS for pictures of 8 bits, by formula for deeper ones.
+
+Most profiles of photos consist of three primaries and three curves, which become a `ColorSpace`.
+LittleCMS, as Pillow offers it, reads all profiles, but only pictures of 8 bits.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+
+import numpy as np
+from PIL import Image, ImageCms
+
+from spackle.core.color_spaces import D50_XYZ, SRGB, ColorSpace, Floats, Transfer
+
+MAX_TAGS = 100  # a profile has a dozen
+SAME_LIGHT = 0.005  # curves that differ by less are rounded differently
+CURVE_SAMPLES = 256  # where two curves are compared
+_PARAMETER_COUNTS = (1, 3, 4, 5, 7)  # of the five kinds of parametric curves
+Curve = tuple[Floats, Floats]  # positions in 0..1, increasing, and the light there
+
+
+def color_space_of_icc(profile: bytes) -> ColorSpace | None:
+    """The colour space of a profile that consists of primaries and curves; None for any other.
+
+    A profile for grey pictures has one curve, and gets the primaries of sRGB.
+    """
+    try:
+        tags = _tags(profile)
+        kind = profile[16:20]
+        has_tables = any(name in tags for name in (b"A2B0", b"A2B1", b"A2B2"))
+        if has_tables or profile[20:24] != b"XYZ ":
+            return None
+        if kind == b"GRAY":
+            curves = [_curve(tags[b"kTRC"])] * 3
+            to_xyz = SRGB.to_xyz
+        elif kind == b"RGB ":
+            curves = [_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC")]
+            to_xyz = np.stack([_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")], axis=1)
+        else:
+            return None
+        # A profile whose primaries do not make its white is broken, or uses them otherwise.
+        if np.abs(to_xyz.sum(axis=1) - D50_XYZ).max() > 0.05:
+            return None
+    except (struct.error, KeyError, ValueError, IndexError):
+        return None
+    transfer = Transfer("ICC", lambda code: np.stack([np.interp(code, *curve) for curve in curves]))
+    return ColorSpace("ICC profile", transfer, to_xyz, to_xyz[1])
+
+
+def is_srgb_profile(profile: bytes) -> bool:
+    """Whether a profile says what sRGB says, so that nothing is to be converted.
+
+    A profile that does not consist of primaries and curves is judged by its name.
+    """
+    space = color_space_of_icc(profile)
+    if space is None:
+        return "sRGB" in _description(profile)
+    numbers = np.linspace(0, 1, CURVE_SAMPLES)
+    light_difference = np.abs(space.transfer.decode(numbers) - SRGB.transfer.decode(numbers)).max()
+    primaries_difference = np.abs(space.to_xyz - SRGB.to_xyz).max()
+    return bool(max(light_difference, primaries_difference) < SAME_LIGHT)
+
+
+def convert_by_profile(image: Image.Image, profile: bytes) -> Image.Image | None:
+    """The image in sRGB, converted by LittleCMS; None if the profile is broken or does not fit it.
+
+    Args:
+        image: in one of the modes RGB, L, CMYK and LAB.
+        profile: the ICC profile.
+    """
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        target = ImageCms.createProfile("sRGB")
+        return ImageCms.profileToProfile(image, source, target, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return None
+
+
+def convert_lab(image: Image.Image) -> Image.Image | None:
+    """An image in CIE L*a*b* (of D50, as TIFF defines it) in sRGB; None if it cannot be."""
+    try:
+        source = ImageCms.createProfile("LAB")
+        target = ImageCms.createProfile("sRGB")
+        return ImageCms.profileToProfile(image, source, target, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return None
+
+
+def _description(profile: bytes) -> str:
+    """The name of a profile; empty if it is broken."""
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        return ImageCms.getProfileDescription(source)
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return ""
+
+
+def _tags(profile: bytes) -> dict[bytes, bytes]:
+    """The tags of a profile with their content; struct.error if it is cut off."""
+    (count,) = struct.unpack_from(">I", profile, 128)
+    tags: dict[bytes, bytes] = {}
+    for index in range(min(count, MAX_TAGS)):
+        name, place, size = struct.unpack_from(">4sII", profile, 132 + 12 * index)
+        tags[name] = profile[place : place + size]
+    return tags
+
+
+def _xyz(tag: bytes) -> Floats:
+    """[3]: the X, Y, Z of a tag; ValueError for another kind of tag."""
+    if tag[:4] != b"XYZ ":
+        raise ValueError("no XYZ")
+    return np.array(struct.unpack_from(">3i", tag, 8)) / 65536  # fractions of 2^16
+
+
+def _curve(tag: bytes) -> Curve:
+    """The curve of a tag, from a number to light; ValueError for another kind of tag."""
+    kind = tag[:4]
+    if kind == b"curv":
+        (count,) = struct.unpack_from(">I", tag, 8)
+        if count == 0:  # no entry: light is the number itself
+            return np.array([0.0, 1.0]), np.array([0.0, 1.0])
+        if count == 1:  # one entry: an exponent as a fraction of 2^8
+            return _sampled_power(struct.unpack_from(">H", tag, 12)[0] / 256)
+        light = np.frombuffer(tag, ">u2", count, 12) / 65535
+        return np.linspace(0, 1, count), light
+    if kind == b"para":
+        return _parametric(tag)
+    raise ValueError("no curve")
+
+
+def _sampled_power(gamma: float) -> Curve:
+    """The curve light = number ** gamma at the numbers that a picture of 16 bits can have."""
+    numbers = np.linspace(0, 1, 65536)
+    return numbers, numbers**gamma
+
+
+def _parametric(tag: bytes) -> Curve:
+    """The curve of a tag `para`: a power, and below a threshold a line."""
+    (kind,) = struct.unpack_from(">H", tag, 8)
+    values = np.array(struct.unpack_from(f">{_PARAMETER_COUNTS[kind]}i", tag, 12)) / 65536
+    # The names are those of ICC's specification: (a·x + b)^g + e where x ≥ d, else c·x + f.
+    g, a, b, c, d, e, f = (values[0], 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if kind >= 1:
+        a, b = values[1:3]
+        d = -b / a if a else 0.0
+    if kind == 2:
+        e = f = values[3]
+    if kind >= 3:
+        c, d = values[3:5]
+    if kind == 4:
+        e, f = values[5:7]
+    numbers = np.linspace(0, 1, 65536)
+    power = np.maximum(a * numbers + b, 0) ** g + e
+    light = np.where(numbers >= d, power, c * numbers + f)
+    if not np.isfinite(light).all():
+        raise ValueError("a curve that is not finite")
+    return numbers, np.clip(light, 0, 1)
