@@ -375,10 +375,19 @@ class Pipeline:
         # the video is just such a view, the video need not render it again.
         if not views.frame_maker.is_plain:
             return FilledHoles(aux=filled.aux)
-        pictures = {
-            views.views_to_fill[position]: picture for position, picture in filled.pictures.items()
-        }
+        pictures = {}
+        for position, picture in filled.pictures.items():
+            index = views.views_to_fill[position]
+            frame_index = views.frame_within.get(index, index)
+            pictures[frame_index] = _without_margin(picture, views.cameras[frame_index])
         return FilledHoles(aux=filled.aux, pictures=pictures)
+
+
+def _without_margin(picture: Tensor, camera: Camera) -> Tensor:
+    """The middle [H, W, 3] of a picture, which is all that a camera with H × W pixels shows."""
+    top = (len(picture) - camera.height) // 2
+    left = (picture.shape[1] - camera.width) // 2
+    return picture[top : top + camera.height, left : left + camera.width]
 
 
 def _fill_each_view(
@@ -391,14 +400,15 @@ def _fill_each_view(
 
     Args:
         context: the photo's Gaussians, and the settings of the fill.
-        views: the planned views, all of which are filled.
+        views: the planned views; those that are shown are filled.
         aux_of_view: makes the Gaussians that fill the holes of a camera's view.
         progress: called with (views done, all views).
     """
+    shown_cameras = views.cameras[: views.shown_view_count]
     by_view: list[Gaussians] = []
-    for camera in views.cameras:
+    for camera in shown_cameras:
         by_view.append(aux_of_view(camera))
-        progress(len(by_view), len(views.cameras))
+        progress(len(by_view), len(shown_cameras))
 
     # A file of a scene has room for one set of aux Gaussians. The reported view farthest from the
     # photo is chosen, because the holes grow with the distance.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -375,8 +375,14 @@ class PlannedViews:
     frames: list[tuple[int, ...]]  # each video frame's view, or the two views of its eyes
     # The views whose holes are measured for the report, by their names in the report.
     reported_views: dict[str, int]
-    views_to_fill: list[int]  # not every frame, because neighbours in a path show the same holes
+    # Not every frame of a long video, because neighbours in a path show the same holes.
+    views_to_fill: list[int]
     always_filled: frozenset[int]  # those that are filled even if views near them are filled
+    # Views that are filled instead of frames, which they show with a margin; and their frames.
+    frame_within: dict[int, int]
+    # The first views of `cameras` are this number of views that are shown in the video, reported or
+    # given; those after them are only filled.
+    shown_view_count: int
     # The first views of `cameras` are this number of views that the user gave. They are also saved
     # as pictures.
     given_view_count: int
@@ -389,8 +395,9 @@ class _PathViews:
 
     frame_cameras: list[Camera]  # of the video's frames; of a stereo video, midway between the eyes
     filled_frame_step: int = 1  # every first, second, … of these frames is filled
+    # Pixels left and right, above and below, by which filled views are larger than their frames.
+    filled_margin_px: tuple[int, int] = (0, 0)
     reported_cameras: dict[str, Camera] = dataclasses.field(default_factory=dict)  # by name
-    cameras_without_overscan: Sequence[Camera] = ()  # filled besides the frames, for other viewers
 
 
 def plan_views(
@@ -451,23 +458,19 @@ def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathVie
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
     # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other
-    # programs show the scene without it, so the outermost views are filled without it, too. The
-    # leftmost and rightmost view are filled anyway, because they are reported. For trajectories
-    # that also go up and down, the lowest and the highest view are added.
-    without_overscan: Sequence[Camera] = ()
-    if path.trajectory in ("shake", "rotate", "vertical"):
-        # Five cameras on a circle are below, right, above, left and below again.
-        circle = trajectory_cameras("rotate", camera, disparity, depth_range, frames=5)
-        lowest = circle[0]
-        highest = circle[2]
-        without_overscan = [lowest, highest]
+    # programs show the scene without it. So the fill works on frames with a margin, in which they
+    # show as much as the photo's own lens.
+    filled_margin_px = (
+        math.ceil(path.overscan * camera.width / 2),
+        math.ceil(path.overscan * camera.height / 2),
+    )
 
     return _PathViews(
         frame_cameras=frame_cameras,
         # Of a long path every second, third, … frame is filled, so that 60 to 119 frames are.
         filled_frame_step=max(1, len(frame_cameras) // DEFAULT_FRAME_COUNT),
+        filled_margin_px=filled_margin_px,
         reported_cameras={f"-{disparity:g}": leftmost, f"+{disparity:g}": rightmost},
-        cameras_without_overscan=without_overscan,
     )
 
 
@@ -500,8 +503,8 @@ def _index_views(
 ) -> PlannedViews:
     """Put all views of a path into one list, and say by indices which view serves what.
 
-    The order is: given views that are no frames, the frames' views, views without overscan,
-    reported views.
+    The order is: given views that are no frames, the frames' views, reported views, and views that
+    are only filled.
 
     Args:
         path_views: the cameras of the video's frames, and those that are filled besides.
@@ -524,29 +527,46 @@ def _index_views(
         cameras.extend(eyes)
     frame_view_end = len(cameras)  # index after the last frame's views
 
-    cameras.extend(path_views.cameras_without_overscan)
     reported_views = {
         name: len(cameras) + position for position, name in enumerate(path_views.reported_cameras)
     }
     cameras.extend(path_views.reported_cameras.values())
+    shown_view_count = len(cameras)
+    always_filled = frozenset(range(frame_view_end, shown_view_count))
     # Given views bring no cameras just for the report, because it measures all of them. They are
     # the first views of the list.
     if not reported_views:
         reported_views = {str(index): index for index in range(len(path_views.frame_cameras))}
 
     views_to_fill = list(range(middle_view_count))
+    # A frame that is filled with a margin around it is filled as a larger view of its own.
+    frame_within: dict[int, int] = {}
     for frame in frames[:: path_views.filled_frame_step]:
-        views_to_fill.extend(frame)
-    views_to_fill.extend(range(frame_view_end, len(cameras)))
+        for index in frame:
+            if path_views.filled_margin_px == (0, 0):
+                views_to_fill.append(index)
+            else:
+                views_to_fill.append(len(cameras))
+                frame_within[len(cameras)] = index
+                cameras.append(_with_margin(cameras[index], path_views.filled_margin_px))
+    views_to_fill.extend(sorted(always_filled))
 
     return PlannedViews(
         cameras=cameras,
         frames=frames,
         reported_views=reported_views,
         views_to_fill=views_to_fill,
-        # The fill leaves out views near those that it has filled. These views may stand where a
-        # frame stands, but without the frame's zoom (overscan) they show more at their border.
-        always_filled=frozenset(range(frame_view_end, len(cameras))),
+        # The fill leaves out views near those that it has filled. What the report measures is
+        # filled in any case.
+        always_filled=always_filled,
+        frame_within=frame_within,
+        shown_view_count=shown_view_count,
         given_view_count=len(given_views),
         frame_maker=frame_maker,
     )
+
+
+def _with_margin(camera: Camera, margin_px: tuple[int, int]) -> Camera:
+    """A view with more pixels on all sides: (left and right, above and below)."""
+    across, down = margin_px
+    return camera.cropped(-across, -down, camera.width + 2 * across, camera.height + 2 * down)

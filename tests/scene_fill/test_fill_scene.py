@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import pytest
@@ -58,6 +59,14 @@ def path_of(
     )
 
 
+def turned_right(camera: Camera, degrees: float, right: float = 0.0) -> Camera:
+    """The camera moved to the right, and turned to the right."""
+    angle = math.radians(degrees)
+    eye = torch.tensor([right, 0.0, 0.0])
+    direction = torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+    return camera.looking(eye, eye + direction)
+
+
 @pytest.mark.parametrize("network", [False, True])
 def test_a_completed_view_equals_a_full_rendering(network: bool) -> None:
     context, camera = box_view(0.4)
@@ -86,9 +95,33 @@ def test_an_empty_view_is_filled_with_a_wall(
 
 def test_the_order_of_views() -> None:
     camera = Camera.from_focal(50, 40, 30)
-    order = farthest_first([shifted(camera, x) for x in (-1.0, -0.2, 0.0, 0.6, 1.1)], camera)
-    assert order == [4, 0, 3, 1, 2]  # the photo's camera counts as visited
-    assert sorted(farthest_first([camera] * 3, camera)) == [0, 1, 2]
+    views = [shifted(camera, x) for x in (-1.0, -0.2, 0.0, 0.6, 1.1)]
+    assert farthest_first(views, camera, 1.0) == [4, 0, 3, 1, 2]  # the photo's camera counts
+    assert sorted(farthest_first([camera] * 3, camera, 1.0)) == [0, 1, 2]
+
+
+def test_views_from_one_eye_are_ordered_by_what_they_show() -> None:
+    camera = Camera.from_focal(50, 40, 30)
+    turned = [turned_right(camera, degrees) for degrees in (1.0, 2.0, 30.0, 29.0, 0.0)]
+    assert farthest_first(turned, camera, 1.0) == [2, 1, 3, 0, 4]
+    # A wider view shows more than one that is zoomed; the photo's own zoom comes last.
+    zoomed = [camera, camera.zoomed(1.1), camera.zoomed(0.7)]
+    assert farthest_first(zoomed, camera, 1.0)[0] == 2
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_the_order_of_views_does_not_depend_on_the_scenes_unit(scale: float) -> None:
+    camera = Camera.from_focal(50, 40, 30)
+    offsets = [(-1.0, 0.0), (0.2, 20.0), (0.0, -30.0), (0.4, 0.0)]
+    orders = [
+        farthest_first(
+            [turned_right(camera, degrees, right=unit * x) for x, degrees in offsets],
+            camera,
+            unit,
+        )
+        for unit in (1.0, scale)
+    ]
+    assert orders[0] == orders[1]
 
 
 def test_no_aux_gaussian_of_a_scene_hides_the_photo() -> None:
@@ -108,7 +141,7 @@ def test_no_aux_gaussian_of_a_scene_hides_the_photo() -> None:
 def test_an_underlay_is_hidden_and_closes_holes_of_neighbours() -> None:
     context, _ = box_view(width=160, height=120)
     path = path_of(context)
-    index = farthest_first(path, context.photo_camera)[0]
+    index = farthest_first(path, context.photo_camera, context.near_depth)[0]
     camera, before = path[index], CPU.render(context.base, path[index])
     features = ViewFeatures.of(before)
     mask, seen = features.mask, ~hole_mask(before.alpha)
@@ -175,40 +208,37 @@ def test_an_underlay_is_not_visible_beyond_the_border(monkeypatch: pytest.Monkey
         assert float(group_by_cell(with_rims - without)[beyond].abs().max()) < 0.03
 
 
-# With 0.3, holes of the last views of "rotate" have almost exactly the ratio up to which they stay
-# open (19 pixels, of 19.2), so that the last bits of a processor would decide.
 @pytest.mark.parametrize(
     ("kind", "disparity"), [("rotate-forward", 0.3), ("rotate", 0.2), ("swipe", 0.3)]
 )
-def test_half_of_the_frames_are_visited_and_all_are_filled(
+def test_all_frames_are_filled_and_a_view_that_shows_the_same_is_not_rendered_again(
     kind: TrajectoryKind, disparity: float
 ) -> None:
     calls: list[tuple[int, int]] = []
     context, _ = box_view(width=160, height=120)
+    renderer = CountingRenderer()
+    context = dataclasses.replace(context, renderer=renderer)
     path = path_of(context, kind, disparity)
-    # The command line adds the widest views, too.
-    views = [
-        *path,
-        *leftmost_and_rightmost(context.photo_camera, disparity, DepthRange.of(context.base)),
-    ]
+    # The command line adds the widest views, too. Players repeat a video, so views come twice.
+    widest = leftmost_and_rightmost(context.photo_camera, disparity, DepthRange.of(context.base))
+    views = [*path, *widest, *path]
     filled = fill_scene(context, views, progress=lambda done, total: calls.append((done, total)))
-    visits = len(views) // 2
-    assert calls == [(k, visits) for k in range(1, visits + 1)]
+    assert calls == [(k, len(views)) for k in range(1, len(views) + 1)]
+    assert len(renderer.cameras) <= 1 + len(path) + len(widest)  # the photo, each view once
+
     after = [CPU.render([context.base, filled.aux], camera) for camera in views]
     assert len(filled.pictures) > 3
     for index, picture in filled.pictures.items():  # equal to the final scene, bit for bit
         assert torch.equal(picture, to_uint8(after[index].rgb))
-    left = [hole_area_ratio(view.alpha) for view in after]
-    assert max(left) <= 2e-3
-    assert sum(left) / len(left) <= 5e-4
-    for index in farthest_first(path, context.photo_camera)[:GUARDED_VIEWS]:
+    assert max(hole_area_ratio(view.alpha) for view in after) <= 1e-3
+    for index in farthest_first(path, context.photo_camera, context.near_depth)[:GUARDED_VIEWS]:
         before = CPU.render(context.base, path[index])
         seen = ~hole_mask(before.alpha)
         assert psnr(after[index].rgb[seen], before.rgb[seen]) >= 45
-    fill_scene(
-        context, path[::5], exact=True, progress=lambda done, total: calls.append((done, total))
-    )
-    assert calls[-1] == (12, 12)  # no view of an exact path is skipped
+
+    renderer.cameras.clear()
+    fill_scene(context, path[::5], exact=True)
+    assert len(renderer.cameras) == 12  # no view of an exact path is left out
 
 
 class CountingRenderer(CpuRenderer):
@@ -232,7 +262,7 @@ def test_a_scene_renders_the_photo_once() -> None:
     assert len(fill_scene(context, cameras).aux) > 100
     photo_renderings = [camera for camera in renderer.cameras if camera is context.photo_camera]
     assert len(photo_renderings) == 1
-    assert len(renderer.cameras) == 1 + len(cameras)  # each view once in full
+    assert len(renderer.cameras) <= 1 + len(cameras)  # each view at most once in full
     # Another base must not get the old one's photo.
     other = dataclasses.replace(context, base=context.base.select(slice(100)))
     assert not same_bits(other.photo_rendering, context.photo_rendering)

@@ -8,12 +8,14 @@ import copy
 import dataclasses
 import functools
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.core.trajectories import NEAR_QUANTILE
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.completion import CellChoice, view_type_of
@@ -110,6 +112,18 @@ class FillContext:
         """The base rendered from the photo's camera, on the renderer's device."""
         base = self.on_renderer_device.base
         return self.photo_cache.render(self.renderer, base, self.photo_camera)
+
+    @property
+    def near_depth(self) -> float:
+        """Depth of the nearest surfaces that the photo shows, in the scene's unit.
+
+        It is the same small quantile that camera paths use (z_near); 1 if the photo shows nothing.
+        """
+        rendering = self.photo_rendering
+        visible_depth = rendering.depth[rendering.alpha >= self.threshold]
+        if not len(visible_depth):
+            return 1.0
+        return float(np.quantile(visible_depth.cpu().numpy(), NEAR_QUANTILE))
 
     @property
     def without_network(self) -> FillContext:

@@ -6,6 +6,7 @@ The renderer and the network run on the renderer's device; all other code runs o
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Mapping, Sequence
 
 import torch
@@ -34,7 +35,10 @@ OPPOSITE_VIEWS = 2
 # effect would be invisible.
 MIN_HOLE_RATIO_FOR_NETWORK = 0.01
 INVISIBLE_HOLE_RATIO = 1e-3  # a smaller fraction of hole pixels is invisible in a frame of a path
-MIN_VIEWS_TO_FILL = 24  # half of a path's frames are checked, and at least this many
+# A view of a path that differs less from a visited view shows the same, and is not visited. In the
+# unit of disparity: at 1, the nearest surfaces move across the picture. Here they move by a part of
+# a pixel; movements of half a pixel can already open a slit.
+MIN_VIEW_DIFFERENCE = 2e-4
 PHOTO = -1  # the photo's index among the guarded views
 
 
@@ -96,7 +100,8 @@ def fill_scene(
 ) -> FilledScene:
     """Complete all views of a path with one set of Gaussians.
 
-    The widest views come first, then always the view farthest from all earlier ones. Each view is
+    The widest views come first, then always the view that differs most from all earlier ones. Each
+    view is
     rendered with the base (the Gaussians predicted from the photo) and all Gaussians added before,
     and then gets new Gaussians in its holes and beneath the rims of its holes. New Gaussians lie
     behind all surfaces that the photo, the widest views and earlier views show.
@@ -105,11 +110,9 @@ def fill_scene(
         context: the photo's base and the settings of the fill.
         cameras: the frames of a path in order; with `exact`, any views.
         exact: check every view, and complete every view that has a hole. Otherwise invisibly small
-            holes may remain, and only half of a long path's frames are checked.
-        progress: called with (number of visited views, number of views to visit).
-        always_filled: indices of cameras that are checked even if they are not in that half. The
-            half is chosen by the cameras' positions alone. So it may leave out a view that stands
-            at the place of another, but shows more (it is wider, or looks elsewhere).
+            holes may remain, and views that show nearly the same as a checked view are not checked.
+        progress: called with (number of views that are done, number of views).
+        always_filled: indices of cameras that are checked in any case.
     """
     device = context.base.means.device
     if not cameras:
@@ -117,10 +120,11 @@ def fill_scene(
 
     # Everything is done on the renderer's device; the result returns to the base's device.
     filling = _SceneFilling(context.on_renderer_device, cameras, exact, always_filled)
-    for count, index in enumerate(filling.views_to_fill, start=1):
-        filling.visit(index)
+    for count, index in enumerate(filling.order, start=1):
+        if filling.needs_visit(index):
+            filling.visit(index)
         if progress:
-            progress(count, len(filling.views_to_fill))
+            progress(count, len(filling.order))
     filled = filling.finish()
     return FilledScene(filled.aux.to(device), filled.pictures)
 
@@ -135,36 +139,32 @@ class _SceneFilling:
         exact: bool,
         always_filled: Collection[int],
     ) -> None:
-        """Choose the views to fill, render the widest ones, and guard the surfaces they show.
+        """Put the views in order, render the widest ones, and guard the surfaces they show.
 
         Args:
             context: the photo's base and the settings of the fill, on the renderer's device.
             cameras: the views.
-            exact: visit every view, and leave no hole. Otherwise only half of the views are
-                visited, and invisibly small holes stay open.
+            exact: visit every view, and leave no hole. Otherwise views that show nearly the same
+                as a visited one are left out, and invisibly small holes stay open.
             always_filled: indices of views that are visited in any case.
         """
         self.context = context
         self.cameras = cameras
         self.exact = exact
-        order = farthest_first(cameras, context.photo_camera)
-        if exact:
-            self.views_to_fill = order
-            self.max_hole_ratio = 0.0
-        else:
-            # The first half is spread over the whole path. The views of the second half lie between
-            # them, and show hardly anything that their neighbours do not show.
-            first_half = max(MIN_VIEWS_TO_FILL, len(order) // 2)
-            others = [index for index in order[first_half:] if index in always_filled]
-            self.views_to_fill = [*order[:first_half], *others]
-            self.max_hole_ratio = INVISIBLE_HOLE_RATIO
+        self.always_filled = set(always_filled)
+        self.max_hole_ratio = 0.0 if exact else INVISIBLE_HOLE_RATIO
+        near_depth = context.near_depth
+        self.order = farthest_first(cameras, context.photo_camera, near_depth)
+        self.differences = view_differences(cameras, context.photo_camera, near_depth)  # [V, V]
+        # [V] whether a visited view shows nearly the same.
+        self.is_settled = torch.zeros(len(cameras), dtype=torch.bool)
 
         # No new Gaussian may hide what the photo or one of the widest views shows.
         self.renderer = IncrementalRenderer(context.renderer, context.base)
         self.guards = {PHOTO: context.photo_guard()}  # by the view's index; PHOTO: the photo's
         # Renderings of the base alone, by the view's index; dropped when the view is visited.
         self.base_renderings: dict[int, Rendering] = {}
-        for index in order[:GUARDED_VIEWS]:
+        for index in self.order[:GUARDED_VIEWS]:
             self.base_renderings[index] = self.renderer.render(cameras[index])
             self.guards[index] = OcclusionGuard.of(
                 self.base_renderings[index], cameras[index], context.threshold
@@ -181,8 +181,13 @@ class _SceneFilling:
         # [H, W, 3] uint8 sRGB, by the view's index: final renderings, as long as nothing is added.
         self.pictures: dict[int, Tensor] = {}
 
+    def needs_visit(self, index: int) -> bool:
+        """Whether a view may still have visible holes: no visited view shows nearly the same."""
+        return self.exact or index in self.always_filled or not self.is_settled[index]
+
     def visit(self, index: int) -> None:
         """Render a view with everything added so far, and fill its holes if they are visible."""
+        self.is_settled |= self.differences[index] < MIN_VIEW_DIFFERENCE
         camera = self.cameras[index]
         base_rendering = self.base_renderings.pop(index, None)  # no longer needed afterwards
         rendering = self.renderer.render(camera, base_rendering)
@@ -308,20 +313,59 @@ def _fill_in_passes(
     return _FilledHoles(aux, underlays, rendering)
 
 
-def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
-    """Indices of views: first the view farthest from the photo, then always the view farthest from
-    all earlier views.
+def farthest_first(cameras: Sequence[Camera], photo_camera: Camera, near_depth: float) -> list[int]:
+    """Indices of views: first the view that differs most from the photo's, then always the view
+    that differs most from all earlier ones.
 
-    The first n views are thus spread evenly over the path, for any n.
+    The first n views are thus spread evenly over what all views show, for any n.
+
+    Args:
+        cameras: the views.
+        photo_camera: the camera of the photo.
+        near_depth: depth of the nearest surfaces, in the scene's unit.
     """
-    if not cameras:
-        return []
-    eyes = torch.stack([camera.position.double() for camera in cameras])  # [views, 3]
-    distance = (eyes - photo_camera.position.double()).norm(dim=-1)
+    differences = view_differences([*cameras, photo_camera], photo_camera, near_depth)
+    nearest = differences[-1, :-1].clone()  # of each view, from the photo's or an earlier view
     order: list[int] = []
     for _ in cameras:
-        farthest = int(distance.argmax())
+        farthest = int(nearest.argmax())
         order.append(farthest)
-        distance = torch.minimum(distance, (eyes - eyes[farthest]).norm(dim=-1))
-        distance[farthest] = -1.0  # not again, even if views coincide
+        nearest = torch.minimum(nearest, differences[farthest, :-1])
+        nearest[order] = -1.0  # not again, even if views coincide
     return order
+
+
+def view_differences(cameras: Sequence[Camera], photo_camera: Camera, near_depth: float) -> Tensor:
+    """[V, V] float64: how much any two of V views differ in what they show of a scene.
+
+    Views differ if they are seen from elsewhere, and also if they look elsewhere or are wider. A
+    difference of 1 moves the nearest surfaces across the picture's whole diagonal, as a disparity
+    of 1 does.
+
+    Args:
+        cameras: the V views.
+        photo_camera: the camera of the photo; its picture's diagonal is the unit.
+        near_depth: depth of the nearest surfaces, in the scene's unit.
+    """
+    fx, fy = photo_camera.focal
+    diagonal = math.hypot(photo_camera.width / fx, photo_camera.height / fy)  # in focal lengths
+    contents = torch.stack([_shown_content(camera, near_depth) for camera in cameras])  # [V, 15]
+    return torch.cdist(contents, contents) / diagonal
+
+
+def _shown_content(camera: Camera, near_depth: float) -> Tensor:
+    """[15] float64 numbers whose Euclidean distance says how differently two cameras see a scene.
+
+    The first three are the eye, the others the directions to the frame's four corners. Both are
+    measured as movements in the picture, in focal lengths: an eye that moves by t moves the nearest
+    surfaces by t / near_depth, and a camera that turns moves everything by the angle.
+    """
+    corners = torch.tensor(
+        [[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]],
+        dtype=torch.float64,
+    )
+    eye = camera.position.double()
+    corner_points = camera.unproject(corners, torch.ones(4, dtype=torch.float64))  # at depth 1
+    directions = corner_points - eye
+    # The four corners say the same turn four times, so half of each counts: √(4 · ½²) = 1.
+    return torch.cat([eye / near_depth, directions.flatten() / 2])

@@ -228,7 +228,8 @@ def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Rendere
     _, inverse_depths = render_completed(views, renderer)
     targets = views.rgb.clone()
     painted: list[int] = []  # views whose holes are filled
-    for index in farthest_first(views.cameras, views.prediction.camera):
+    near_depth = DepthRange.of(views.prediction.gaussians).near
+    for index in farthest_first(views.cameras, views.prediction.camera, near_depth):
         camera = views.cameras[index]
         target = targets[index]
         hole = views.mask[index].clone()
