@@ -50,9 +50,12 @@ def evaluate(
     disparity: DisparitiesOption = "0.3,0.4,0.5",
     side: SideOption = None,
     second_views: Annotated[
-        Literal["all", "nearest"],
-        typer.Option(help="Near views: all second photos of the scene, or the nearest."),
-    ] = "all",
+        Literal["auto", "adjacent", "nearest", "spread", "all"],
+        typer.Option(
+            help="Near views: neighbouring frames, the nearest three photos, eight spread from "
+            "near to far, or all of the scene. auto: adjacent for wildrgbd, else spread."
+        ),
+    ] = "auto",
     metrics: Annotated[
         str | None,
         typer.Option(

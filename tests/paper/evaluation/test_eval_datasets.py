@@ -8,7 +8,7 @@ import math
 import shutil
 import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -23,10 +23,14 @@ from spackle.core.focal_length import FocalSource
 from spackle.core.photo import working_size
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.evaluation.alignment import align, camera_in_base_scene
-from spackle.paper.evaluation.case import Case, Points, known_depth, load_case
-from spackle.paper.evaluation.datasets import read_cases
-from spackle.paper.evaluation.datasets.multiview import spread_over_scenes
-from spackle.paper.evaluation.evaluation import open_evaluation
+from spackle.paper.evaluation.case import Case, Points, SecondViews, known_depth, load_case
+from spackle.paper.evaluation.datasets import DATASETS, read_cases
+from spackle.paper.evaluation.datasets.multiview import (
+    PosedPhoto,
+    make_cases,
+    spread_over_scenes,
+)
+from spackle.paper.evaluation.evaluation import choose_second_views, open_evaluation
 from spackle.paper.evaluation.options import EvaluateOptions
 from spackle.runtime.errors import InputError
 
@@ -271,7 +275,8 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
         "metrics": (),
         "residual": "initial",
     }
-    for choice, count in (("all", 7), ("nearest", 3)):
+    choices: dict[SecondViews, int] = {"all": 7, "nearest": 3, "spread": 7, "adjacent": 1}
+    for choice, count in choices.items():
         evaluation = open_evaluation(
             EvaluateOptions(
                 dataset="llff",
@@ -284,6 +289,36 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
         assert len(evaluation.cases[0].second_views) == count
         assert evaluation.config["second_views"] == choice
     assert first.depth_bounds == (3.0, 6.0)
+
+
+def test_by_default_video_frames_have_neighbours_and_photos_have_eight_others() -> None:
+    defaults = {name: dataset.second_views for name, dataset in DATASETS.items()}
+    assert {name for name, choice in defaults.items() if choice == "adjacent"} == {"wildrgbd"}
+    assert {choice for name, choice in defaults.items() if name != "wildrgbd"} == {"spread"}
+    for name, choice in defaults.items():
+        options = EvaluateOptions(dataset=name, root=Path("unused"), protocol="near-view")
+        assert options.chosen_second_views == choice
+
+    # 300 cameras along a line, of which one has a photo on both sides.
+    photos = []
+    for index in range(300):
+        camera = Camera.from_focal(60, 64, 48)
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3] = -0.01 * index
+        camera = dataclasses.replace(camera, K=camera.K.double(), world_to_camera=pose)
+        photos.append(PosedPhoto(f"{index:03d}", Path(f"{index}.png"), camera, middle_depth=2.0))
+    (case,) = make_cases(photos, [100])
+    chosen = {
+        choice: [view.name for view in choose_second_views(case.second_views, choice)]
+        for choice in get_args(SecondViews)
+    }
+    assert sorted(chosen["adjacent"]) == ["099", "101"]
+    assert (len(chosen["all"]), len(chosen["spread"])) == (299, 8)
+    distances = [abs(int(name) - 100) for name in chosen["spread"]]
+    assert distances == sorted(distances)
+    # Their mean distance is that of all views, within a few per cent.
+    all_distances = [abs(int(name) - 100) for name in chosen["all"]]
+    assert sum(distances) / 8 == pytest.approx(sum(all_distances) / 299, rel=0.03)
 
 
 def test_frames_are_spread_evenly() -> None:

@@ -186,7 +186,7 @@ def test_the_near_view_tables_have_the_papers_layout_and_numbers() -> None:
     assert [row[-1] for row in near.bodies[1]] == ["0.4837", "0.6042", "0.4589"]
     (missing,) = [note for note in near.notes if "LPIPS not run" in note or "LPIPS" in note[:20]]
     assert "distance" in missing
-    assert near.notes[0].startswith("Views: all other photos")
+    assert near.notes[0].startswith("Views of Booster: from the cameras of all other")
     dense, guided, *papers = cells(ablation, "Booster")
     assert tuple(dense) == (
         "Dense grid init‡ (rgbd)",

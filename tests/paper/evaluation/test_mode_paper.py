@@ -17,6 +17,7 @@ from spackle.bases.depth import RgbdBase
 from spackle.bases.open import wrap_loaded_base
 from spackle.bases.settings import BaseSettings
 from spackle.core.gaussians import Gaussians
+from spackle.formats.camera_set import CameraSet
 from spackle.formats.ply import PlyFile
 from spackle.paper.evaluation.case import known_depth, load_case
 from spackle.paper.evaluation.evaluation import Evaluation, open_evaluation
@@ -26,6 +27,7 @@ from spackle.paper.evaluation.protocols import large_views
 from spackle.pipeline import FillOptions, Pipeline, PipelineOptions
 from spackle.residual import MIN_AUX_GAUSSIANS, hole_mask
 from spackle.runtime.progress import LogReporter
+from spackle.views import GivenPath
 
 
 def opened(root: Path, network: spackle.residual.ResidualNet | None) -> Evaluation:
@@ -59,10 +61,22 @@ def test_the_pipeline_adds_the_gaussians_of_the_evaluation_bit_for_bit(
         base=wrap_loaded_base(RgbdBase(known_depth(case.case))),
         network=network,
         renderer=evaluation.renderer,
-        given_views=cameras,
+        given_path=GivenPath(
+            cameras=CameraSet(
+                source=Path("views.json"),
+                kind="Spackle",
+                cameras=tuple(camera.to(dtype=torch.float64) for camera in cameras),
+                names=("",) * len(cameras),
+                origin=None,
+            )
+        ),
     )
-    scene = pipeline.complete(case.full_photo, LogReporter(False)).scene
+    completed = pipeline.complete(case.full_photo, LogReporter(False))
+    scene = completed.scene
     assert scene.by_view is not None
+    for camera, filled_camera in zip(cameras, completed.views.cameras, strict=True):
+        assert torch.equal(camera.world_to_camera, filled_camera.world_to_camera)
+        assert torch.equal(camera.K, filled_camera.K)
 
     context = evaluation.fill_context(prediction)
     assert same_bits(scene.base, context.base)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,6 +20,11 @@ from spackle.core.photo import MAX_WORKING_SIDE_PX, Photo, load_photo, resize_ph
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.evaluation.measurements import NEAR_SETTING
 from spackle.runtime.errors import InputError
+
+# Which second photos of a case near views use: those before and after it in the scene's order; the
+# few nearest that show the same; a few, spread from the nearest to the farthest; or all.
+SecondViews = Literal["adjacent", "nearest", "spread", "all"]
+MAX_SPREAD_VIEWS = 8  # of a case, for "spread"; with "all", Tanks alone would have 150,000 views
 
 # The accepted relative difference between the aspect ratios of a photo and of its calibration.
 ASPECT_RATIO_TOLERANCE = 0.01
@@ -36,6 +41,8 @@ class SecondView:
     camera: Camera
     # Whether it is one of the few close views that `second_views` "nearest" evaluates.
     is_among_nearest: bool = True
+    # Whether it is the photo before or after the case's in the scene's order, as in a video.
+    is_adjacent: bool = True
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,14 @@ from spackle.bases.depth import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, wrap_loaded_base
 from spackle.bases.settings import describe_base
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
-from spackle.paper.evaluation.case import Case, LoadedCase, SecondView, known_depth
+from spackle.paper.evaluation.case import (
+    MAX_SPREAD_VIEWS,
+    Case,
+    LoadedCase,
+    SecondView,
+    SecondViews,
+    known_depth,
+)
 from spackle.paper.evaluation.datasets import find_dataset, find_scenes, read_cases
 from spackle.paper.evaluation.datasets.labels import read_label
 from spackle.paper.evaluation.datasets.multiview import evenly_spaced_items
@@ -129,14 +136,26 @@ def _cases_to_evaluate(options: EvaluateOptions) -> list[Case]:
     # Second photos that are not compared are dropped, so that they are not read.
     chosen_cases = []
     for case in cases:
-        if not options.compares_with_photos:  # large views are not compared with photos
-            second_views: tuple[SecondView, ...] = ()
-        elif options.second_views == "nearest":
-            second_views = tuple(view for view in case.second_views if view.is_among_nearest)
-        else:
-            second_views = case.second_views
-        chosen_cases.append(dataclasses.replace(case, second_views=second_views))
+        second_views: Sequence[SecondView] = ()
+        if options.compares_with_photos:  # large views are not compared with photos
+            second_views = choose_second_views(case.second_views, options.chosen_second_views)
+        chosen_cases.append(dataclasses.replace(case, second_views=tuple(second_views)))
     return chosen_cases
+
+
+def choose_second_views(views: Sequence[SecondView], choice: SecondViews) -> Sequence[SecondView]:
+    """The second photos of a case that are compared.
+
+    `views` are all other photos of the scene, the nearest camera first.
+    """
+    if choice == "adjacent":
+        return [view for view in views if view.is_adjacent]
+    if choice == "nearest":
+        return [view for view in views if view.is_among_nearest]
+    # Evenly spaced in the order of distances, so that their mean stands for that of all.
+    if choice == "spread" and len(views) > MAX_SPREAD_VIEWS:
+        return evenly_spaced_items(views, MAX_SPREAD_VIEWS)
+    return views
 
 
 def _open_metrics(
@@ -212,7 +231,7 @@ def _configuration(
         "protocol": options.protocol,
         "side": options.max_side,  # the long side of views, in pixels
         "disparities": None if options.compares_with_photos else list(options.disparities),
-        "second_views": options.second_views if options.compares_with_photos else None,
+        "second_views": options.chosen_second_views if options.compares_with_photos else None,
         "base": _base_configuration(options),
         "device": renderer.device.type,  # where renderer and networks run
         "methods": list(options.methods),

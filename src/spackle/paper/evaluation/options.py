@@ -12,6 +12,7 @@ import torch
 from spackle.bases.settings import BaseSettings
 from spackle.core.photo import MAX_WORKING_SIDE_PX
 from spackle.core.trajectories import MAX_DISPARITY
+from spackle.paper.evaluation.case import SecondViews
 from spackle.paper.evaluation.datasets import find_dataset
 from spackle.paper.evaluation.method_descriptions import METHODS
 from spackle.paper.evaluation.metrics import METRICS
@@ -21,7 +22,6 @@ from spackle.runtime.errors import InputError, check_name
 from spackle.runtime.plugins import check_name_or_plugin, is_plugin, load_function
 
 Protocol = Literal["large-view", "near-view"]
-SecondViews = Literal["all", "nearest"]
 
 # Long side of the paper's large views. That it is not 1536, as of near views, follows from the
 # paper's counts of added Gaussians: they are (1280 / 1536)² of the masked cells that views of
@@ -61,7 +61,8 @@ class EvaluateOptions:
     dense_residual: Path | None = None
     inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
-    second_views: SecondViews = "all"  # which second photos of a case near views use
+    # Which second photos of a case near views use; "auto" is the dataset's own choice.
+    second_views: SecondViews | Literal["auto"] = "auto"
     # Long side of the views, in pixels; None: the paper's, 1280 for large views, 1536 for near
     # ones.
     side: int | None = None
@@ -72,6 +73,13 @@ class EvaluateOptions:
     def compares_with_photos(self) -> bool:
         """Whether the views are at the viewpoints of second photos, and are compared with these."""
         return self.protocol == "near-view"
+
+    @property
+    def chosen_second_views(self) -> SecondViews:
+        """Which second photos of a case near views use, with "auto" decided by the dataset."""
+        if self.second_views == "auto":
+            return find_dataset(self.dataset).second_views
+        return self.second_views
 
     @property
     def max_side(self) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from spackle.paper.evaluation.case import MAX_SPREAD_VIEWS
 from spackle.paper.evaluation.measurements import (
     BASE_PARAMETERS,
     NOTE_PREFIX,
@@ -31,6 +32,16 @@ TIMED_WORK_NOTE = (
     "guards it, a rendering at the photo's camera is included. No run uses what another has "
     "computed."
 )
+# Which second photos near views were compared with, by `SecondViews`.
+SECOND_VIEWS_TEXTS = {
+    "adjacent": "the photos before and after the input in its scene, as neighbouring frames",
+    "nearest": "the three nearest other photos of the scene that show the same",
+    "spread": (
+        f"the scene's other photos; of more than {MAX_SPREAD_VIEWS}, {MAX_SPREAD_VIEWS} spread "
+        "from the nearest to the farthest"
+    ),
+    "all": "all other photos of the scene",
+}
 NO_NETWORK = "–"  # instead of a number of parameters
 MAX_LISTED_IMAGES = 5  # the most names in a note about images that could not be measured
 
@@ -152,12 +163,8 @@ def _views_note(run: Run) -> str:
             "farthest right and looks at the focus point; "
             f"long side {run.config['side']} pixels."
         )
-    if run.config["second_views"] == "nearest":
-        return (
-            "Views: of the scene's other photos the three nearest that show the same, from their "
-            "own cameras."
-        )
-    return "Views: all other photos of the scene, from their own cameras."
+    photos = SECOND_VIEWS_TEXTS[run.config["second_views"]]
+    return f"Views of {run.title}: from the cameras of {photos}."
 
 
 def _methods_notes(layout: TableLayout, runs: Sequence[Run]) -> list[str]:

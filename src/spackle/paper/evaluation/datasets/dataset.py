@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from spackle.paper.evaluation.case import Case
+from spackle.paper.evaluation.case import Case, SecondViews
 
 
 def folder_name(folder: Path) -> str:
@@ -43,6 +43,8 @@ class EvalDataset:
     read_cases: Callable[[Mapping[str, Path]], list[Case]]
     # Names of folders that are not searched: without ground truth, or with the same photos again.
     skipped_folders: Sequence[str] = ()
+    # Which second photos of a case near views use, unless the user chooses.
+    second_views: SecondViews = "spread"
     # From a scene's folder to a name that no other scene has.
     scene_name: Callable[[Path], str] = folder_name
 

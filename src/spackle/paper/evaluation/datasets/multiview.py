@@ -117,10 +117,10 @@ def make_cases(
     The nearest three views that meet these conditions are marked as near; there may be fewer, or
     none: the camera is 5 % to 25 % of the photo's middle depth away, is turned by at most 30°, and
     sees at least 30 % of the photo's points. If points are unknown, each camera must instead see
-    the middle of the other's view.
+    the middle of the other's view. The photos before and after the case's are marked as adjacent.
 
     Args:
-        photos: all photos of a scene.
+        photos: all photos of a scene, in their order, as in a video.
         case_indices: indices of the photos that become cases; None: all.
     """
     if not photos:
@@ -171,6 +171,7 @@ def _make_case(scene: _PosedScene, index: int) -> Case:
             photo=scene.photos[other].photo,
             camera=camera,
             is_among_nearest=other in near_indices,
+            is_adjacent=abs(other - index) == 1,
         )
         second_views.append(second_view)
 
