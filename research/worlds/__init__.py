@@ -1,0 +1,1 @@
+"""Made worlds to learn from: furnished rooms with exact depth, seen by several cameras."""

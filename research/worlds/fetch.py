@@ -1,0 +1,64 @@
+"""Fetch the models by apt into a folder of their own; nothing is installed.
+
+    PYTHONPATH=src:research python -m worlds.fetch
+
+Debian's packages are downloaded and unpacked below the cache folder: WORLDS_CACHE, or
+~/.cache/spackle-worlds.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from worlds.library import Library
+
+from spackle.runtime.errors import InputError
+
+PACKAGES = ("sweethome3d-furniture", "sweethome3d")
+CATALOGUES = "usr/share/sweethome3d/furniture"
+
+
+def cache_folder(given: Path | None = None) -> Path:
+    """Where models are kept: the given folder, WORLDS_CACHE, or a folder of the user."""
+    if given is not None:
+        return given
+    default = Path.home() / ".cache" / "spackle-worlds"
+    return Path(os.environ.get("WORLDS_CACHE", default))
+
+
+def fetch(folder: Path) -> None:
+    """Download and unpack Debian's packages, unless they are there.
+
+    Raises:
+        InputError: apt-get or dpkg is missing or fails.
+    """
+    root = folder / "root"
+    if (root / CATALOGUES).is_dir():
+        return
+    archives = folder / "debs"
+    archives.mkdir(parents=True, exist_ok=True)
+    try:
+        subprocess.run(["apt-get", "download", *PACKAGES], cwd=archives, check=True)
+        for archive in sorted(archives.glob("*.deb")):
+            subprocess.run(["dpkg", "-x", str(archive), str(root)], check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise InputError(
+            f"{folder}: cannot fetch {' and '.join(PACKAGES)} ({error}): needs Debian or Ubuntu; "
+            "run `apt-get update` first"
+        ) from error
+
+
+def open_library(cache: Path | None = None) -> Library:
+    """All models; fetched and converted at the first call, which takes minutes."""
+    folder = cache_folder(cache)
+    fetch(folder)
+    catalogues = sorted((folder / "root" / CATALOGUES).glob("*.sh3f"))
+    return Library.open(folder / "library", catalogues, lambda line: print(line, file=sys.stderr))
+
+
+if __name__ == "__main__":
+    models = open_library().models
+    print(f"{len(models)} models, {sum(model.triangles for model in models):,} triangles")

@@ -1,0 +1,688 @@
+"""How much light falls on each place of a world, on a grid of small cells on its surfaces.
+
+The light is kept in the world, not in a picture, so all views of a world agree. Cells are about
+five pixels wide. Each cell sends rays over its hemisphere; where they end, coarse cells tell how
+bright that surface is, and these have gathered light from each other several times. Light of
+windows and lamps is sampled directly. Sunlight has sharp shadows, and is left to the picture.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from worlds.caster import NUDGE_M, World
+from worlds.lights import Lights
+
+from spackle.runtime.kernels import kernel
+
+Floats = NDArray[np.float32]
+Longs = NDArray[np.int64]
+BASE_CELL_M = 0.01  # width of cells at level 0; each level doubles it
+CELL_PX = 5.0  # width of a cell in the photo
+MAX_LEVEL = 9  # cells of 5 m
+COARSE_LEVEL = 20  # a name for the coarse cells, which have one width everywhere
+GATHER_RAYS = 40  # of a fine cell
+COARSE_RAYS = 24  # of a coarse cell
+PORTAL_RAYS = 16  # of a cell towards the windows
+LAMP_RAYS = 4  # of a cell towards each lamp
+BOUNCES = 6
+COARSE_SAMPLES = 4  # places of a coarse cell at which sunlight is looked for
+EMPTY = -1
+CHUNK = 400_000  # rays at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Cells:
+    """Cells by their keys, and what represents each."""
+
+    table: Longs  # [2^k] keys, EMPTY where free
+    slots: Longs  # [2^k] the cell's number
+    position: Floats  # [C, 3] a point of a surface in the cell
+    normal: Floats  # [C, 3]
+
+
+@dataclasses.dataclass(frozen=True)
+class Irradiance:
+    """Light on the surfaces of a world, without direct sunlight."""
+
+    cells: Cells
+    light: Floats  # [C, 3] irradiance
+    coarse: Cells
+    coarse_light: Floats  # [D, 3] irradiance, with sunlight
+    coarse_m: float
+    eye: Floats  # [3] the photo's camera, around which cells grow
+    angle: float  # width of a cell over its distance from the eye
+    mean: Floats  # [3] where no cell is known
+
+    def at(self, positions: Floats, normals: Floats) -> Floats:
+        """[N, 3] irradiance at points [N, 3] with unit normals [N, 3]."""
+        result = np.zeros_like(positions)
+        levels = cell_levels(positions, self.eye, self.angle)
+        _interpolate(
+            self.cells.table,
+            self.cells.slots,
+            self.cells.position,
+            self.cells.normal,
+            self.light,
+            positions,
+            normals,
+            levels,
+            np.float32(BASE_CELL_M),
+            self.mean,
+            result,
+        )
+        return result
+
+    def roughly_at(self, positions: Floats, normals: Floats) -> Floats:
+        """[N, 3] irradiance of coarse cells, with sunlight, for what is seen in reflections."""
+        result = np.zeros_like(positions)
+        levels = np.full(len(positions), COARSE_LEVEL, np.float32)
+        _interpolate(
+            self.coarse.table,
+            self.coarse.slots,
+            self.coarse.position,
+            self.coarse.normal,
+            self.coarse_light,
+            positions,
+            normals,
+            levels,
+            np.float32(self.coarse_m / 2.0**COARSE_LEVEL),
+            self.mean,
+            result,
+        )
+        return result
+
+
+def cell_levels(positions: Floats, eye: Floats, angle: float) -> Floats:
+    """[N] levels of cells at points [N, 3], as fractions, so that cells are equally wide seen
+    from the eye.
+    """
+    distance = np.linalg.norm(positions - eye, axis=1)
+    levels = np.log2(np.maximum(distance * angle / BASE_CELL_M, 1e-6))
+    return np.clip(levels, 0, MAX_LEVEL - 1).astype(np.float32)
+
+
+def solve(
+    world: World,
+    lights: Lights,
+    rng: np.random.Generator,
+    positions: Floats,
+    normals: Floats,
+    eye: Floats,
+    focal_px: float,
+    coarse_m: float,
+) -> Irradiance:
+    """Light on all surfaces that some views see.
+
+    Args:
+        world, lights: the world.
+        rng: directions of rays.
+        positions, normals: [N, 3] points that the views see, and their unit normals.
+        eye: [3] the photo's camera.
+        focal_px: the photo's focal length.
+        coarse_m: width of coarse cells in metres.
+    """
+    angle = CELL_PX / focal_px
+    levels = cell_levels(positions, eye, angle)
+    cells = _cells(positions, normals, levels, BASE_CELL_M, both_levels=True)
+    count = len(cells.position)
+
+    # Where the rays of fine cells end, there coarse cells are needed.
+    ends, end_normals, end_cell, missed = _gather(world, rng, cells.position, cells.normal, GATHER_RAYS)
+    fixed = coarse_m / 2.0**COARSE_LEVEL
+    every = np.full(len(ends), COARSE_LEVEL, np.float32)
+    coarse = _cells(ends, end_normals, every, fixed, both_levels=False)
+    link = _find(coarse, ends, end_normals, fixed)
+    albedo = _coarse_albedo(world, coarse, link, end_cell)
+    direct = _direct(world, lights, rng, coarse.position, coarse.normal)
+    direct += _sunlight(world, lights, rng, ends, end_normals, link, len(coarse.position))
+
+    # Coarse cells light each other.
+    coarse_ends, coarse_normals, coarse_hit, coarse_missed = _gather(
+        world, rng, coarse.position, coarse.normal, COARSE_RAYS
+    )
+    known = np.full(len(coarse_missed), EMPTY, np.int64)
+    known[~coarse_missed] = _find(coarse, coarse_ends, coarse_normals, fixed)
+    del coarse_hit
+    sky = _sky_light(lights, world, rng, coarse.position, coarse.normal, coarse_missed, COARSE_RAYS)
+    table = known.reshape(-1, COARSE_RAYS)
+    light = direct + sky
+    mean_reflected = (albedo * light).mean(0)
+    for _ in range(BOUNCES):
+        reflected = np.concatenate([albedo * light, mean_reflected[None]])
+        seen = np.where(table >= 0, table, len(coarse.position))
+        gathered = reflected[seen] * (~coarse_missed.reshape(-1, COARSE_RAYS))[..., None]
+        light = direct + sky + gathered.mean(1) + math.pi * lights.ambient
+        mean_reflected = (albedo * light).mean(0)
+
+    # Fine cells gather from coarse ones.
+    fine_link = np.full(len(missed), EMPTY, np.int64)
+    fine_link[~missed] = link
+    reflected = np.concatenate([albedo * light, np.zeros((1, 3), np.float32)])
+    gathered = reflected[fine_link.reshape(count, GATHER_RAYS)].mean(1)
+    gathered = gathered + math.pi * lights.ambient
+    gathered += _sky_light(lights, world, rng, cells.position, cells.normal, missed, GATHER_RAYS)
+    gathered = _smoothed(cells, gathered.astype(np.float32), positions, normals, levels)
+    total = gathered + _direct(world, lights, rng, cells.position, cells.normal)
+    return Irradiance(
+        cells,
+        total.astype(np.float32),
+        coarse,
+        light.astype(np.float32),
+        coarse_m,
+        eye.astype(np.float32),
+        angle,
+        total.mean(0).astype(np.float32),
+    )
+
+
+def _cells(
+    positions: Floats, normals: Floats, levels: Floats, base_m: float, *, both_levels: bool
+) -> Cells:
+    """One cell for each place and side of the given points; the point nearest its middle stands
+    for it.
+    """
+    room = 1 << max(10, int(len(positions) * 1.6).bit_length())
+    table = np.full(room, EMPTY, np.int64)
+    slots = np.zeros(room, np.int64)
+    best = np.full(room, np.inf, np.float32)
+    chosen = np.zeros(room, np.int64)
+    count = _insert(
+        table, slots, best, chosen, positions, normals, levels, np.float32(base_m), both_levels
+    )
+    return Cells(table, slots, positions[chosen[:count]], normals[chosen[:count]])
+
+
+def _find(cells: Cells, positions: Floats, normals: Floats, base_m: float) -> Longs:
+    """[N] the numbers of the coarse cells in which points lie; EMPTY for none."""
+    result = np.zeros(len(positions), np.int64)
+    _lookup(cells.table, cells.slots, positions, normals, np.float32(base_m), result)
+    return result
+
+
+def _gather(
+    world: World, rng: np.random.Generator, positions: Floats, normals: Floats, rays: int
+) -> tuple[Floats, Floats, tuple[Any, Any, Any], NDArray[np.bool_]]:
+    """Send `rays` rays from each point, more along the normal than sideways.
+
+    Returns:
+        Positions and normals of the ends [M, 3]; triangle and barycentric weights of the ends;
+        and [N · rays] which rays end nowhere.
+    """
+    ends, sides, triangles, us, vs, missed = [], [], [], [], [], []
+    step = max(1, CHUNK // rays)
+    for first in range(0, len(positions), step):
+        part = slice(first, first + step)
+        directions = hemisphere(rng, normals[part], rays).reshape(-1, 3)
+        origins = np.repeat(positions[part] + NUDGE_M * 4 * normals[part], rays, 0)
+        hits = world.first_hits(origins, directions)
+        met = hits.triangle >= 0
+        _, flat = world.normals(hits, directions)
+        ends.append((origins + hits.distance[:, None] * directions)[met])
+        sides.append(flat[met])
+        triangles.append(hits.triangle[met])
+        us.append(hits.u[met])
+        vs.append(hits.v[met])
+        missed.append(~met)
+    return (
+        np.concatenate(ends).astype(np.float32),
+        np.concatenate(sides),
+        (np.concatenate(triangles), np.concatenate(us), np.concatenate(vs)),
+        np.concatenate(missed),
+    )
+
+
+def hemisphere(rng: np.random.Generator, normals: Floats, rays: int) -> Floats:
+    """[N, rays, 3] unit vectors around unit normals [N, 3], with a density as their cosine.
+
+    The rays of one point are spread evenly, by a spiral that is turned at random.
+    """
+    number = (np.arange(rays) + rng.random((len(normals), 1))) / rays
+    turn = rng.random((len(normals), 1)) * 2 * math.pi
+    azimuth = turn + np.arange(rays) * 2.399963  # the golden angle
+    radius = np.sqrt(number)
+    x = radius * np.cos(azimuth)
+    y = radius * np.sin(azimuth)
+    z = np.sqrt(np.maximum(0, 1 - number))
+    first, second = tangents(normals)
+    return np.asarray(
+        x[..., None] * first[:, None] + y[..., None] * second[:, None] + z[..., None] * normals[:, None],
+        np.float32,
+    )
+
+
+def tangents(normals: Floats) -> tuple[Floats, Floats]:
+    """Two unit vectors [N, 3] at right angles to unit normals [N, 3] and to each other."""
+    # Duff et al., Building an orthonormal basis, revisited (2017).
+    x, y, z = normals[:, 0], normals[:, 1], normals[:, 2]
+    sign = np.where(z >= 0, 1.0, -1.0).astype(np.float32)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], -1)
+    second = np.stack([b, sign + y * y * a, -y], -1)
+    return first.astype(np.float32), second.astype(np.float32)
+
+
+def _coarse_albedo(
+    world: World, coarse: Cells, link: Longs, ends: tuple[Any, Any, Any]
+) -> Floats:
+    """[C, 3] mean linear colour of the surfaces in coarse cells."""
+    triangle, _, _ = ends
+    material = world.mesh.material[triangle]
+    number = np.maximum(world.texture[material], 0)
+    textured = world.texture[material] >= 0
+    means = np.where(textured[:, None], world.pyramids.mean[number], 1.0)
+    colors = world.color[material] * means
+    count = len(coarse.position)
+    weights = np.bincount(link, minlength=count)
+    sums = [np.bincount(link, colors[:, k], minlength=count) for k in range(3)]
+    return (np.stack(sums, -1) / np.maximum(weights, 1)[:, None]).astype(np.float32)
+
+
+def _direct(
+    world: World, lights: Lights, rng: np.random.Generator, positions: Floats, normals: Floats
+) -> Floats:
+    """[N, 3] irradiance from windows and lamps."""
+    total = np.zeros((len(positions), 3), np.float32)
+    step = max(1, CHUNK // PORTAL_RAYS)
+    for first in range(0, len(positions), step):
+        part = slice(first, first + step)
+        total[part] += _from_portals(world, lights, rng, positions[part], normals[part])
+        for number in range(len(lights.lamp_positions)):
+            total[part] += _from_lamp(world, lights, rng, positions[part], normals[part], number)
+    return total
+
+
+def _from_portals(
+    world: World, lights: Lights, rng: np.random.Generator, positions: Floats, normals: Floats
+) -> Floats:
+    """[N, 3] irradiance from the sky through the windows."""
+    count = len(lights.portals)
+    total = np.zeros((len(positions), 3), np.float32)
+    if not count:
+        return total
+    each = max(4, PORTAL_RAYS // count)
+    grid = math.ceil(math.sqrt(each))
+    for corner, side, other in lights.portals:
+        area_normal = np.cross(side, other)
+        area = float(np.linalg.norm(area_normal))
+        area_normal = area_normal / area
+        facing = (((positions - (corner + side / 2 + other / 2)) @ area_normal) > 0.0).nonzero()[0]
+        if not len(facing):
+            continue
+        cells = grid * grid
+        place = np.arange(cells)
+        a = (place % grid + rng.random((len(facing), cells))) / grid
+        b = (place // grid + rng.random((len(facing), cells))) / grid
+        targets = corner + a[..., None] * side + b[..., None] * other
+        ways = (targets - positions[facing, None]).astype(np.float32)
+        distance = np.linalg.norm(ways, axis=-1)
+        directions = ways / np.maximum(distance, 1e-6)[..., None]
+        cosine = (directions * normals[facing, None]).sum(-1)
+        other_cosine = -(directions @ area_normal.astype(np.float32))
+        use = (cosine > 0) & (other_cosine > 0)
+        origins = np.broadcast_to(
+            (positions[facing] + NUDGE_M * 4 * normals[facing])[:, None], ways.shape
+        )
+        open_way = np.zeros(use.shape, bool)
+        # A curtain outside of the window's plane blocks as well, so the ray goes on a little.
+        open_way[use] = ~world.blocked(origins[use], directions[use], distance[use] + 0.3)
+        weight = cosine * other_cosine * area / np.maximum(distance, 0.05) ** 2 / cells
+        weight = np.where(open_way, weight, 0.0)
+        radiance = lights.sky_radiance(directions.reshape(-1, 3)).reshape(*use.shape, 3)
+        total[facing] += (weight[..., None] * radiance).sum(1).astype(np.float32)
+    return total
+
+
+def _from_lamp(
+    world: World,
+    lights: Lights,
+    rng: np.random.Generator,
+    positions: Floats,
+    normals: Floats,
+    number: int,
+) -> Floats:
+    """[N, 3] irradiance from one lamp, a ball; the lamp's own body does not shade it."""
+    radius = float(lights.lamp_radii[number])
+    jitter = rng.standard_normal((len(positions), LAMP_RAYS, 3))
+    jitter *= radius / np.maximum(np.linalg.norm(jitter, axis=-1, keepdims=True), 1e-6)
+    ways = lights.lamp_positions[number] + jitter - positions[:, None]
+    distance = np.linalg.norm(ways, axis=-1)
+    directions = (ways / np.maximum(distance, 1e-6)[..., None]).astype(np.float32)
+    cosine = np.maximum((directions * normals[:, None]).sum(-1), 0)
+    reach = distance - 1.5 * radius
+    use = (cosine > 0) & (reach > 0)
+    origins = np.broadcast_to((positions + NUDGE_M * 4 * normals)[:, None], ways.shape)
+    open_way = use.copy()
+    open_way[(cosine > 0) & (reach <= 0)] = True  # within the lamp's shade
+    open_way[use] = ~world.blocked(
+        origins[use].astype(np.float32), directions[use], reach[use].astype(np.float32)
+    )
+    falloff = np.where(open_way, cosine / np.maximum(distance, 2 * radius) ** 2, 0.0).mean(1)
+    return np.asarray(falloff[:, None] * lights.lamp_colors[number], np.float32)
+
+
+def _sunlight(
+    world: World,
+    lights: Lights,
+    rng: np.random.Generator,
+    ends: Floats,
+    normals: Floats,
+    link: Longs,
+    count: int,
+) -> Floats:
+    """[count, 3] mean irradiance from the sun on coarse cells, at a few points of each."""
+    total = np.zeros((count, 3), np.float32)
+    if not lights.sun_color.any():
+        return total
+    order = rng.permutation(len(ends))
+    sorted_order = order[np.argsort(link[order], kind="stable")]
+    cell = link[sorted_order]
+    starts = np.searchsorted(cell, np.arange(count))
+    rank = np.arange(len(cell)) - starts[cell]
+    chosen = sorted_order[rank < COARSE_SAMPLES]
+    seen = sun_on(world, lights, rng, ends[chosen], normals[chosen])
+    tallies = np.bincount(link[chosen], minlength=count)
+    sums = np.bincount(link[chosen], seen, minlength=count) / np.maximum(tallies, 1)
+    return np.asarray(sums[:, None] * lights.sun_color, np.float32)
+
+
+def sun_on(
+    world: World, lights: Lights, rng: np.random.Generator, positions: Floats, normals: Floats
+) -> Floats:
+    """[N] cosine towards the sun where it shines, 0 in shadow."""
+    spread = rng.standard_normal((len(positions), 3)) * lights.sun_spread / 2
+    directions = lights.sun_direction + spread
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions.astype(np.float32)
+    cosine = (directions * normals).sum(1)
+    lit = np.zeros(len(positions), np.float32)
+    facing = np.flatnonzero(cosine > 0)
+    origins = positions[facing] + NUDGE_M * 4 * normals[facing]
+    far = np.full(len(facing), 1e4, np.float32)
+    blocked = world.blocked(origins, directions[facing], far)
+    lit[facing[~blocked]] = cosine[facing[~blocked]]
+    return lit
+
+
+def _sky_light(
+    lights: Lights,
+    world: World,
+    rng: np.random.Generator,
+    positions: Floats,
+    normals: Floats,
+    missed: NDArray[np.bool_],
+    rays: int,
+) -> Floats:
+    """[N, 3] irradiance of the open sky, from the share of rays that end nowhere.
+
+    Behind windows the sky is sampled directly, so it does not count again.
+    """
+    del world, rng
+    if len(lights.portals):
+        return np.zeros((len(positions), 3), np.float32)
+    openness = missed.reshape(-1, rays).mean(1)
+    above = lights.sky[: lights.sky.shape[0] // 2].mean((0, 1))
+    side = 0.6 + 0.4 * np.maximum(normals[:, 2], 0)
+    return np.asarray(math.pi * (openness * side)[:, None] * above, np.float32)
+
+
+def _smoothed(
+    cells: Cells, light: Floats, positions: Floats, normals: Floats, levels: Floats
+) -> Floats:
+    """[C, 3] the light of cells, averaged with neighbours of the same surface, against noise."""
+    del positions, normals, levels
+    result = light.copy()
+    _smooth(cells.table, cells.slots, cells.position, cells.normal, light, np.float32(BASE_CELL_M), result)
+    return result
+
+
+OFFSET = 1 << 17  # of cell coordinates, so that they are not negative
+
+
+@kernel
+def _key(level: int, x: int, y: int, z: int, side: int) -> int:
+    """One number for a cell: its level, place and side."""
+    return (
+        (((((level << 18) | (x + 131072)) << 18) | (y + 131072)) << 18 | (z + 131072)) * 8 + side
+    ) & 0x7FFFFFFFFFFFFFFF
+
+
+@kernel
+def _side(x: float, y: float, z: float) -> int:
+    """Which of six directions a normal is nearest to."""
+    a = abs(x)
+    b = abs(y)
+    c = abs(z)
+    if a >= b and a >= c:
+        return 0 if x >= 0 else 1
+    if b >= c:
+        return 2 if y >= 0 else 3
+    return 4 if z >= 0 else 5
+
+
+@kernel
+def _slot(table: Any, key: int) -> int:
+    """The place of a key in the table, or the free place where it belongs."""
+    mask = table.shape[0] - 1
+    mixed = key * 0x1E3779B97F4A7C15
+    place = (mixed >> 20) & mask
+    while table[place] != -1 and table[place] != key:
+        place = (place + 1) & mask
+    return place
+
+
+@kernel
+def _insert(
+    table: Any,
+    slots: Any,
+    best: Any,
+    chosen: Any,
+    positions: Any,
+    normals: Any,
+    levels: Any,
+    base: float,
+    both_levels: bool,
+) -> int:
+    """Fill the table with the cells of points; returns the number of cells."""
+    count = 0
+    for n in range(positions.shape[0]):
+        low = int(levels[n])
+        side = _side(normals[n, 0], normals[n, 1], normals[n, 2])
+        for step in range(2 if both_levels else 1):
+            size = base * 2.0 ** (low + step)
+            x = np.floor(positions[n, 0] / size)
+            y = np.floor(positions[n, 1] / size)
+            z = np.floor(positions[n, 2] / size)
+            key = _key(low + step, int(x), int(y), int(z), side)
+            place = _slot(table, key)
+            if table[place] == -1:
+                table[place] = key
+                slots[place] = count
+                count += 1
+            cell = slots[place]
+            dx = positions[n, 0] / size - x - 0.5
+            dy = positions[n, 1] / size - y - 0.5
+            dz = positions[n, 2] / size - z - 0.5
+            away = dx * dx + dy * dy + dz * dz
+            if away < best[cell]:
+                best[cell] = away
+                chosen[cell] = n
+    return count
+
+
+@kernel
+def _lookup(
+    table: Any, slots: Any, positions: Any, normals: Any, base: float, result: Any
+) -> None:
+    """Write the numbers of coarse cells in which points lie; −1 for none."""
+    size = base * 2.0**COARSE_LEVEL
+    for n in range(positions.shape[0]):
+        key = _key(
+            COARSE_LEVEL,
+            int(np.floor(positions[n, 0] / size)),
+            int(np.floor(positions[n, 1] / size)),
+            int(np.floor(positions[n, 2] / size)),
+            _side(normals[n, 0], normals[n, 1], normals[n, 2]),
+        )
+        place = _slot(table, key)
+        result[n] = slots[place] if table[place] == key else -1
+
+
+@kernel
+def _interpolate(
+    table: Any,
+    slots: Any,
+    cell_position: Any,
+    cell_normal: Any,
+    light: Any,
+    positions: Any,
+    normals: Any,
+    levels: Any,
+    base: float,
+    fallback: Any,
+    result: Any,
+) -> None:
+    """Write the light at points: a mean over the eight nearest cells of two levels.
+
+    Cells count by their distance, by how far their surface's plane is from the point, and by
+    the angle between the normals.
+    """
+    for n in range(positions.shape[0]):
+        low = int(levels[n])
+        fraction = levels[n] - low
+        px = positions[n, 0]
+        py = positions[n, 1]
+        pz = positions[n, 2]
+        nx = normals[n, 0]
+        ny = normals[n, 1]
+        nz = normals[n, 2]
+        red = 0.0
+        green = 0.0
+        blue = 0.0
+        weights = 0.0
+        steps = 1 if low == COARSE_LEVEL else 2
+        for step in range(steps):
+            level = low + step
+            size = base * 2.0**level
+            share = 1.0
+            if steps == 2:
+                share = fraction if step == 1 else 1.0 - fraction
+            share += 1e-3
+            gx = px / size - 0.5
+            gy = py / size - 0.5
+            gz = pz / size - 0.5
+            x0 = np.floor(gx)
+            y0 = np.floor(gy)
+            z0 = np.floor(gz)
+            for corner in range(8):
+                i = corner & 1
+                j = (corner >> 1) & 1
+                k = corner >> 2
+                wx = gx - x0 if i == 1 else 1.0 - gx + x0
+                wy = gy - y0 if j == 1 else 1.0 - gy + y0
+                wz = gz - z0 if k == 1 else 1.0 - gz + z0
+                near = wx * wy * wz + 1e-3
+                for axis in range(3):
+                    along = nx if axis == 0 else (ny if axis == 1 else nz)
+                    if abs(along) < 0.25:
+                        continue
+                    side = 2 * axis if along >= 0 else 2 * axis + 1
+                    key = _key(level, int(x0) + i, int(y0) + j, int(z0) + k, side)
+                    place = _slot(table, key)
+                    if table[place] != key:
+                        continue
+                    cell = slots[place]
+                    agree = (
+                        nx * cell_normal[cell, 0]
+                        + ny * cell_normal[cell, 1]
+                        + nz * cell_normal[cell, 2]
+                    )
+                    if agree <= 0.1:
+                        continue
+                    plane = (
+                        abs(
+                            (px - cell_position[cell, 0]) * nx
+                            + (py - cell_position[cell, 1]) * ny
+                            + (pz - cell_position[cell, 2]) * nz
+                        )
+                        / size
+                    )
+                    w = share * near * agree**4 / (1.0 + 30.0 * plane * plane)
+                    red += w * light[cell, 0]
+                    green += w * light[cell, 1]
+                    blue += w * light[cell, 2]
+                    weights += w
+        if weights > 1e-9:
+            result[n, 0] = red / weights
+            result[n, 1] = green / weights
+            result[n, 2] = blue / weights
+        else:
+            result[n, 0] = fallback[0]
+            result[n, 1] = fallback[1]
+            result[n, 2] = fallback[2]
+
+
+@kernel
+def _smooth(
+    table: Any,
+    slots: Any,
+    cell_position: Any,
+    cell_normal: Any,
+    light: Any,
+    base: float,
+    result: Any,
+) -> None:
+    """Write the mean light of each cell and its 26 neighbours of the same level and side."""
+    for place in range(table.shape[0]):
+        key = table[place]
+        if key == -1:
+            continue
+        cell = slots[place]
+        side = key & 7
+        rest = key >> 3
+        z = (rest & 0x3FFFF) - 131072
+        y = ((rest >> 18) & 0x3FFFF) - 131072
+        x = ((rest >> 36) & 0x3FFFF) - 131072
+        level = rest >> 54
+        size = base * 2.0**level
+        red = 0.0
+        green = 0.0
+        blue = 0.0
+        weights = 0.0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    other = _slot(table, _key(level, x + i, y + j, z + k, side))
+                    if table[other] == -1:
+                        continue
+                    near = slots[other]
+                    agree = (
+                        cell_normal[cell, 0] * cell_normal[near, 0]
+                        + cell_normal[cell, 1] * cell_normal[near, 1]
+                        + cell_normal[cell, 2] * cell_normal[near, 2]
+                    )
+                    if agree < 0.7:
+                        continue
+                    plane = (
+                        abs(
+                            (cell_position[near, 0] - cell_position[cell, 0]) * cell_normal[cell, 0]
+                            + (cell_position[near, 1] - cell_position[cell, 1])
+                            * cell_normal[cell, 1]
+                            + (cell_position[near, 2] - cell_position[cell, 2])
+                            * cell_normal[cell, 2]
+                        )
+                        / size
+                    )
+                    w = agree**4 / (1.0 + 30.0 * plane * plane)
+                    red += w * light[near, 0]
+                    green += w * light[near, 1]
+                    blue += w * light[near, 2]
+                    weights += w
+        result[cell, 0] = red / weights
+        result[cell, 1] = green / weights
+        result[cell, 2] = blue / weights

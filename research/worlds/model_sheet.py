@@ -1,0 +1,85 @@
+"""A picture of all models of the library, a small one each, to look at.
+
+    PYTHONPATH=src:research python -m worlds.model_sheet -o SHEETS
+
+Each is seen from the front, above and to the right, in plain light, with its name below.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from worlds.caster import World
+from worlds.fetch import open_library
+from worlds.library import Library, Model
+from worlds.meshes import rotation_z
+from worlds.pictures import linear_to_srgb
+
+SIDE_PX = 112
+CAPTION_PX = 12
+COLUMNS = 14
+PER_SHEET = 140
+AZIMUTH, ELEVATION = 30.0, 22.0  # degrees: where the camera stands, from the model's front
+BACKGROUND = 0.85
+
+
+def model_picture(library: Library, model: Model, side: int) -> NDArray[np.uint8]:
+    """[side, side, 3] the model in plain light, filling the picture."""
+    mesh = library.mesh(model)
+    middle = (mesh.high + mesh.low) / 2
+    mesh = mesh.moved(rotation_z(-AZIMUTH), (rotation_z(-AZIMUTH) @ -middle).tolist())
+    world = World(mesh, {})
+    radius = float(np.linalg.norm(mesh.corners.reshape(-1, 3), axis=1).max()) + 1e-3
+
+    # Parallel rays, from the front and above.
+    up_angle = np.radians(ELEVATION)
+    forward = np.array([0, np.cos(up_angle), -np.sin(up_angle)])
+    up = np.array([0, np.sin(up_angle), np.cos(up_angle)])
+    y, x = np.mgrid[:side, :side]
+    across = (2 * (x + 0.5) / side - 1).reshape(-1, 1) * radius
+    along = (1 - 2 * (y + 0.5) / side).reshape(-1, 1) * radius
+    origins = across * np.array([1, 0, 0]) + along * up - 3 * radius * forward
+    directions = np.broadcast_to(forward, origins.shape).astype(np.float32)
+    hits = world.first_hits(origins.astype(np.float32), np.ascontiguousarray(directions))
+
+    normals, _ = world.normals(hits, directions)
+    footprint = np.full(len(origins), 2 * radius / side, np.float32)
+    light = 0.45 + 0.4 * normals[:, 2:] + 0.25 * (normals @ np.array([[-0.6], [-0.8], [0.0]]))
+    colors = world.albedo(hits, footprint) * np.clip(light, 0.05, None) * hits.passed[:, None]
+    colors = np.where(hits.triangle[:, None] >= 0, colors, BACKGROUND * hits.passed[:, None])
+    return (linear_to_srgb(colors) * 255).astype(np.uint8).reshape(side, side, 3)
+
+
+def sheets(library: Library, output: Path) -> None:
+    """Write the sheets models-00.png and so on, sorted by category."""
+    output.mkdir(parents=True, exist_ok=True)
+    models = sorted(library.models, key=lambda model: (model.entry.category, model.entry.key))
+    tile_height = SIDE_PX + CAPTION_PX
+    for first in range(0, len(models), PER_SHEET):
+        part = models[first : first + PER_SHEET]
+        rows = -(-len(part) // COLUMNS)
+        sheet = Image.new("RGB", (COLUMNS * SIDE_PX, rows * tile_height), "white")
+        draw = ImageDraw.Draw(sheet)
+        for place, model in enumerate(part):
+            corner = (place % COLUMNS * SIDE_PX, place // COLUMNS * tile_height)
+            sheet.paste(Image.fromarray(model_picture(library, model, SIDE_PX)), corner)
+            name = model.entry.key.split("#")[-1][:18]
+            draw.text((corner[0] + 1, corner[1] + SIDE_PX), name, fill="black")
+        sheet.save(output / f"models-{first // PER_SHEET:02d}.png")
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="a folder for the sheets")
+    parser.add_argument("--cache", type=Path, default=None, help="where models are kept")
+    options = parser.parse_args()
+    sheets(open_library(options.cache), options.output)
+
+
+if __name__ == "__main__":
+    main()

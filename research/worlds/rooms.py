@@ -1,0 +1,860 @@
+"""Furnished rooms: the rules by which a room is built and filled. Read `furnish` first.
+
+    living room   sofa at a wall, table before it, rug below, television opposite, armchairs beside
+    bedroom       bed with its head at a wall, a small table at each side, wardrobe, clothes around
+    kitchen       cabinets in a row with sink and stove, cabinets above, fridge, table with chairs
+    dining room   table in the middle, chairs around it that look at it, laid, a lamp above
+    office        desks at walls or in the room, chair before, computer and papers on, shelves
+    bathroom      tiled; bath, basin with small things, toilet, towels
+    child's room  bed, shelves, toys on the floor
+    hobby room    billiards, table tennis, a workshop, things that are stored
+
+Then every room gets bookcases, plants, lamps, pictures, clutter, and sometimes people and pets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from worlds.furniture import Furniture
+from worlds.lights import Lights, made_sky
+from worlds.meshes import Material, Mesh, box, joined, quad, rotation_z
+from worlds.placing import WALLS, Opening, Place, Placed, WallName
+from worlds.shell import (
+    WALL_M,
+    WHITE,
+    WallFrame,
+    curtain,
+    door_way,
+    made_shelf,
+    material_of,
+    picture_frame,
+    strip,
+    wall_with_openings,
+    window_frame,
+)
+from worlds.surfaces import Surface, surfaces
+
+Rng = np.random.Generator
+Bytes = NDArray[np.uint8]
+DrawPhoto = Callable[[Rng], Bytes]  # gives a random photo [H, W, 3] sRGB
+
+KINDS = ("living", "bedroom", "kitchen", "dining", "office", "bathroom", "kids", "hobby")
+KIND_SHARES = (0.26, 0.15, 0.15, 0.12, 0.12, 0.06, 0.07, 0.07)
+NEUTRAL_SATURATION = 0.12  # a colour with less is grey: no one chose it
+SKIN_SHARE = 0.75  # of the grey materials of furniture get another colour or a texture
+SOFT_GROUPS = ("sofa", "armchair", "bed", "kids_bed")
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldPlan:
+    """All that a world consists of, ready for the caster."""
+
+    kind: str
+    mesh: Mesh
+    pictures: dict[str, Bytes]  # made textures by name
+    lights: Lights
+    place: Place
+    models: tuple[str, ...]  # keys of the models in it, for attribution
+
+
+class Builder:
+    """Collects the meshes of a room while its rules run."""
+
+    def __init__(self, rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None) -> None:
+        """Start with an empty room of random kind and size."""
+        self.rng = rng
+        self.furniture = furniture
+        self.cache = cache / "surfaces"
+        self.photo = photo
+        self.parts: list[Mesh] = []
+        self.pictures: dict[str, Bytes] = {}
+        self.lamps: list[tuple[tuple[float, float, float], float, NDArray[np.float64]]] = []
+        self.lit: set[int] = set()  # numbers of things whose shades shine
+        self.kind = str(rng.choice(KINDS, p=KIND_SHARES))
+        small = self.kind in ("bathroom", "kitchen")
+        width = rng.uniform(2.0, 3.6) if small else rng.uniform(2.8, 6.5)
+        depth = rng.uniform(2.4, 4.2) if small else rng.uniform(3.0, 7.0)
+        height = rng.uniform(2.35, 3.1)
+        self.place = Place(rng, width, depth, height, _openings(rng, width, depth, height, small))
+
+    def of(self, group: str) -> list[object]:
+        """The models of a group."""
+        return list(self.furniture.of(group))
+
+    def surface(self, *kinds: str) -> Surface:
+        """A random surface of one of these kinds."""
+        kind = kinds[int(self.rng.integers(len(kinds)))]
+        found = surfaces(self.cache, kind)
+        return found[int(self.rng.integers(len(found)))]
+
+    def photo_material(self) -> Material:
+        """A photo as a material; an abstract picture if there are no photos."""
+        if self.photo is None:
+            return material_of(self.surface("rug", "wallpaper", "marble"))
+        name = f"photo-{len(self.pictures)}"
+        self.pictures[name] = self.photo(self.rng)
+        return Material((1.0, 1.0, 1.0), name, 0.04, 0.15)
+
+
+def _openings(rng: Rng, width: float, depth: float, height: float, small: bool) -> list[Opening]:
+    """Windows in one or two walls, and a door or passage in another."""
+    walls = list(WALLS)
+    rng.shuffle(walls)
+    openings: list[Opening] = []
+    lengths = {"back": width, "front": width, "left": depth, "right": depth}
+    for wall in walls[: 1 if small else int(rng.choice([1, 2], p=[0.6, 0.4]))]:
+        length = lengths[wall]
+        count = 1 if length < 3.5 else int(rng.integers(1, 4))
+        bottom = float(rng.choice([0.02, rng.uniform(0.5, 1.1)], p=[0.25, 0.75]))
+        top = min(height - 0.12, rng.uniform(1.9, 2.5))
+        each = length / count
+        window = min(rng.uniform(0.7, 2.4), each - 0.4)
+        for number in range(count):
+            start = each * number + (each - window) / 2
+            openings.append(Opening(wall, start, window, bottom, top, "window"))
+    door_wall = walls[2]
+    length = lengths[door_wall]
+    wide = rng.uniform(0.8, 0.95)
+    kind = "door"
+    if rng.random() < 0.45:
+        wide = min(rng.uniform(0.9, 2.4), length - 0.5)
+        kind = "passage"
+    start = rng.uniform(0.15, max(0.16, length - wide - 0.15))
+    top = min(2.08, height - 0.1)
+    openings.append(Opening(door_wall, start, wide, 0.0, top, "door" if kind == "door" else "passage"))
+    return openings
+
+
+def furnish(rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None) -> WorldPlan:
+    """A furnished room with its light."""
+    room = Builder(rng, furniture, cache, photo)
+    RULES[room.kind](room)
+    _everywhere(room)
+    _build_shell(room)
+    _hang_pictures(room)
+    lights = _light(room)
+    for number, thing in enumerate(room.place.things):
+        room.parts.append(_mesh_of(room, thing, number in room.lit))
+    keys = sorted({thing.model.entry.key for thing in room.place.things})
+    return WorldPlan(room.kind, joined(room.parts), room.pictures, lights, room.place, tuple(keys))
+
+
+def _living(room: Builder) -> None:
+    """Sofa, table before it, television opposite, armchairs beside."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    sofa = place.at_wall(find("sofa"), gap=rng.choice([0.03, rng.uniform(0.1, 0.8)]))
+    if sofa is not None:
+        depth = sofa.model.entry.size_m[1]
+        front = sofa.beside(0.0, depth / 2 + rng.uniform(0.5, 0.8))
+        _rug(room, sofa.beside(0.0, depth / 2 + 0.4), sofa.angle)
+        table = place.on_floor(find("coffee_table"), front, 0.06, sofa.angle + rng.normal(0, 4))
+        if table is not None:
+            place.on_top(table, find("living_small"), int(rng.integers(1, 6)), facing=False)
+            place.on_top(table, find("vase") + find("small_plant"), 1)
+        for side in (-1, 1):
+            if rng.random() < 0.6:
+                where = sofa.beside(side * rng.uniform(1.2, 1.9), rng.uniform(1.0, 1.6))
+                place.on_floor(find("armchair"), where, 0.1, sofa.angle - side * rng.uniform(50, 100))
+            if rng.random() < 0.5:
+                beside = sofa.beside(side * (sofa.model.entry.size_m[0] / 2 + 0.35), 0.0)
+                small = place.on_floor(find("bedside"), beside, 0.0, sofa.angle, tries=3)
+                if small is not None:
+                    place.on_top(small, find("table_lamp"), 1)
+        place.on_top(sofa, find("pet") + find("sitting_person"), int(rng.random() < 0.2))
+        opposite = _opposite(sofa.angle)
+        stand = place.at_wall(find("tv_stand"), opposite)
+        if stand is not None:
+            place.on_top(stand, find("tv"), 1, at=(0.0, 0.0))
+            place.on_top(stand, find("living_small") + find("vase"), 3)
+    if rng.random() < 0.25:
+        place.at_wall(find("fireplace"))
+    if rng.random() < 0.12:
+        place.at_wall(find("piano"))
+    if rng.random() < 0.5:
+        _dining_group(room, None)
+
+
+def _bedroom(room: Builder) -> None:
+    """A bed with its head at a wall, a small table at each side, a wardrobe."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    bed = place.at_wall(find("bed"))
+    if bed is not None:
+        width, depth, _ = bed.model.entry.size_m
+        _rug(room, bed.beside(rng.normal(0, 0.4), depth / 2), bed.angle)
+        table = find("bedside")
+        chosen = [table[int(rng.integers(len(table)))]] if table else []
+        for side in (-1, 1):
+            where = bed.beside(side * (width / 2 + 0.33), -depth / 2 + 0.3)
+            small = place.on_floor(chosen, where, 0.0, bed.angle, 0.0, tries=1)
+            if small is not None:
+                place.on_top(small, find("table_lamp"), 1)
+                place.on_top(small, find("bedroom_small"), 2)
+        place.on_top(bed, find("bedroom_small") + find("toy"), int(rng.integers(0, 3)), facing=False)
+        place.on_top(bed, find("pet") + find("floor_person"), int(rng.random() < 0.2), facing=False)
+    place.at_wall(find("wardrobe"))
+    chest = place.at_wall(find("sideboard"))
+    if chest is not None:
+        place.on_top(chest, find("bedroom_small") + find("vase") + find("small_plant"), 4)
+    if rng.random() < 0.5:
+        _desk(room)
+    if rng.random() < 0.5:
+        place.in_corner(find("armchair"))
+
+
+def _kitchen(room: Builder) -> None:
+    """Cabinets in a row with sink and stove, others above, a fridge, a table if there is room."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    lower = find("lower_cabinet")
+    upper = find("upper_cabinet")
+    if lower and upper:
+        # One kitchen has one kind of cabinet.
+        base = lower[int(rng.integers(len(lower)))]
+        family = base.entry.key.split("#")[0]
+        lower = [one for one in lower if one.entry.key.startswith(family)]
+        upper = [one for one in upper if one.entry.key.startswith(family)] or upper
+    walls = list(WALLS)
+    rng.shuffle(walls)
+    for wall in walls[: int(rng.choice([1, 2], p=[0.4, 0.6]))]:
+        length = place.length(wall)
+        along = 0.02 if rng.random() < 0.5 else rng.uniform(0.05, 0.6)
+        special = [find("fridge"), find("sink"), find("stove"), find("washer")]
+        rng.shuffle(special)
+        while along < length - 0.3:
+            group = special.pop() if special and rng.random() < 0.45 else lower
+            if not group:
+                break
+            model = group[int(rng.integers(len(group)))]
+            width = model.entry.size_m[0]
+            if along + width > length:
+                break
+            thing = place.at_wall([model], wall, along + width / 2, margin=-0.01)
+            if thing is not None:
+                if model.entry.size_m[2] < 1.0:
+                    place.on_top(thing, find("kitchen_small"), int(rng.integers(0, 4)))
+                above = upper if group is not find("stove") else find("hood")
+                if rng.random() < 0.75 and model.entry.size_m[2] < 1.3 and above:
+                    chosen = above[int(rng.integers(len(above)))]
+                    place.at_wall([chosen], wall, along + width / 2, z=1.45, margin=-0.02)
+            along += width + 0.002
+    if rng.random() < 0.3:
+        island = place.on_floor(find("island"), angle=float(rng.choice([0, 90])), margin=0.5)
+        if island is not None:
+            place.on_top(island, find("kitchen_small"), 4)
+            place.on_floor(find("stool"), island.beside(0, 0.6), 0.2)
+    _dining_group(room, None)
+
+
+def _dining(room: Builder) -> None:
+    """A table in the middle with chairs, and a sideboard."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    middle = (place.width / 2 + rng.normal(0, 0.3), place.depth / 2 + rng.normal(0, 0.3))
+    _rug(room, middle, float(rng.choice([0, 90])))
+    _dining_group(room, middle)
+    for _ in range(2):
+        board = place.at_wall(find("sideboard"))
+        if board is not None:
+            things = find("vase") + find("small_plant") + find("living_small") + find("table_lamp")
+            place.on_top(board, things, int(rng.integers(2, 6)))
+
+
+def _dining_group(room: Builder, middle: tuple[float, float] | None) -> None:
+    """A table with chairs around it that look at it, laid or not."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    angle = float(rng.choice([0, 90])) + rng.normal(0, 2)
+    table = place.on_floor(find("dining_table"), middle, 0.15, angle, margin=0.35)
+    if table is None:
+        return
+    chairs = find("chair")
+    chair = [chairs[int(rng.integers(len(chairs)))]] if chairs else []
+    width, depth, _ = table.model.entry.size_m
+    seats = [(0.0, depth / 2, 180.0), (0.0, -depth / 2, 0.0)]
+    if width > 1.2:
+        seats = [(side * width / 4, y, turn) for side in (-1, 1) for _, y, turn in seats]
+    seats += [(width / 2, 0.0, -90.0), (-width / 2, 0.0, 90.0)]
+    for sideways, forward, turn in seats:
+        if rng.random() < 0.2:
+            continue
+        out = 0.22 + abs(rng.normal(0, 0.12))
+        away = (
+            sideways + (math.copysign(out, sideways) if forward == 0 else 0),
+            forward + (math.copysign(out, forward) if forward else 0),
+        )
+        # The chair may reach under the table, so it is only kept from other things.
+        x, y = table.beside(*away)
+        if chair:
+            thing = Placed(chair[0], x, y, 0.0, table.angle + turn + rng.normal(0, 8))
+            others = [box_ for box_ in place.taken if box_ != table.box]
+            inside = 0 < thing.box.x0 and thing.box.x1 < place.width
+            inside = inside and 0 < thing.box.y0 and thing.box.y1 < place.depth
+            if inside and not any(thing.box.meets(other) for other in others):
+                place.put(thing)
+                if rng.random() < 0.06:
+                    place.on_top(thing, find("sitting_person"), 1, at=(0.0, 0.05))
+                if rng.random() < 0.7:
+                    inner = (
+                        sideways - (math.copysign(0.25, sideways) if forward == 0 else 0),
+                        forward - (math.copysign(0.25, forward) if forward else 0),
+                    )
+                    place.on_top(table, find("table_setting"), 1, at=inner)
+    things = find("vase") + find("small_plant") + find("kitchen_small") + find("living_small")
+    place.on_top(table, things, int(rng.integers(1, 6)), facing=False)
+    if rng.random() < 0.5:
+        _pendant(room, table.x, table.y)
+
+
+def _office(room: Builder) -> None:
+    """Desks with chairs and computers, shelves."""
+    rng = room.rng
+    place = room.place
+    for _ in range(int(rng.integers(1, 4))):
+        _desk(room)
+    for _ in range(2):
+        cabinet = place.at_wall(room.furniture.of("sideboard"))
+        if cabinet is not None:
+            place.on_top(cabinet, room.furniture.of("office_small"), 3)
+    if rng.random() < 0.5:
+        place.at_wall(room.furniture.of("workshop"))
+
+
+def _desk(room: Builder) -> None:
+    """A desk at a wall, or in the room; a chair before it, a computer and papers on it."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    desk = place.at_wall(find("desk"), gap=rng.choice([0.02, 0.9], p=[0.75, 0.25]), margin=0.2)
+    if desk is None:
+        return
+    depth = desk.model.entry.size_m[1]
+    seat = desk.beside(rng.normal(0, 0.15), depth / 2 + 0.3)
+    place.on_floor(find("desk_chair"), seat, 0.08, desk.angle + 180 + rng.normal(0, 40), 0.0)
+    place.on_top(desk, find("computer"), 1, at=(rng.normal(0, 0.15), -0.05))
+    place.on_top(desk, find("table_lamp"), int(rng.random() < 0.6))
+    place.on_top(desk, find("office_small"), int(rng.integers(2, 7)), facing=False)
+
+
+def _bathroom(room: Builder) -> None:
+    """Bath or shower, basin with small things, toilet, towels."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    place.at_wall(find("bath") if rng.random() < 0.7 else find("shower"))
+    for group, share in (("basin", 1.0), ("toilet", 1.0), ("bidet", 0.3), ("washer", 0.4)):
+        if rng.random() < share:
+            thing = place.at_wall(find(group))
+            if thing is not None and group != "toilet":
+                place.on_top(thing, find("bath_small"), 3)
+    place.at_wall(find("towel_rack"))
+    place.on_floor(find("floor_clutter"), tries=6)
+
+
+def _kids(room: Builder) -> None:
+    """A bed, shelves, and toys on the floor."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    bed = place.at_wall(find("kids_bed"))
+    if bed is not None:
+        place.on_top(bed, find("toy"), 2, facing=False)
+    _desk(room)
+    _rug(room, (place.width / 2, place.depth / 2), 0.0)
+    chest = place.at_wall(find("sideboard"))
+    if chest is not None:
+        place.on_top(chest, find("toy"), 4)
+    place.at_wall(find("wardrobe"))
+    for _ in range(int(rng.integers(4, 12))):
+        place.on_floor(find("toy"))
+    if rng.random() < 0.4:
+        place.on_floor(find("floor_person"))
+
+
+def _hobby(room: Builder) -> None:
+    """Games or a workshop, and things that are stored."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    if rng.random() < 0.6:
+        middle = (place.width / 2, place.depth / 2)
+        place.on_floor(find("hobby"), middle, 0.4, float(rng.choice([0, 90])), 0.4)
+    for _ in range(int(rng.integers(4, 12))):
+        thing = place.at_wall(find("workshop"), gap=rng.uniform(0.02, 0.2))
+        if thing is not None:
+            place.on_top(thing, find("tool"), 2, facing=False)
+    for _ in range(int(rng.integers(1, 5))):
+        place.on_floor(find("workshop"))
+
+
+RULES: dict[str, Callable[[Builder], None]] = {
+    "living": _living,
+    "bedroom": _bedroom,
+    "kitchen": _kitchen,
+    "dining": _dining,
+    "office": _office,
+    "bathroom": _bathroom,
+    "kids": _kids,
+    "hobby": _hobby,
+}
+
+
+def _everywhere(room: Builder) -> None:
+    """What any room may have: bookcases, plants, lamps, clutter, people."""
+    rng = room.rng
+    place = room.place
+    find = room.furniture.of
+    if room.kind not in ("bathroom", "kitchen"):
+        for _ in range(int(rng.integers(0, 4))):
+            _bookcase(room)
+        for _ in range(int(rng.integers(0, 3))):
+            place.at_wall(find("bookcase"))
+        for _ in range(int(rng.integers(0, 2))):
+            place.at_wall(find("sideboard"))
+        place.at_wall(find("radiator")) if rng.random() < 0.3 else None
+    for _ in range(int(rng.choice([0, 1, 2, 4]))):
+        place.in_corner(find("floor_plant"))
+    if rng.random() < 0.3:
+        place.in_corner(find("floor_lamp"))
+    for _ in range(int(rng.choice([0, 1, 3, 6], p=[0.3, 0.3, 0.25, 0.15]))):
+        place.on_floor(find("floor_clutter"))
+    for _ in range(int(rng.integers(0, 3))):
+        place.at_wall(find("wall_thing"), margin=0.0)
+    if rng.random() < 0.12:
+        place.on_floor(find("person"))
+    if rng.random() < 0.08:
+        place.on_floor(find("pet"))
+    for base in list(place.things):
+        # Chairs, chests and shelves collect things.
+        if rng.random() < 0.15 and (base.model.entry.top_m or 0) > 0.3 and base.z < 0.1:
+            place.on_top(base, find("living_small") + find("bedroom_small"), 2, facing=False)
+
+
+def _opposite(angle: float) -> WallName:
+    """The wall at which a thing at this angle looks."""
+    names: tuple[WallName, ...] = ("front", "left", "back", "right")
+    return names[round(-angle / 90) % 4]
+
+
+def _rug(room: Builder, middle: tuple[float, float], angle: float) -> None:
+    """A rug on the floor, below whatever stands there."""
+    rng = room.rng
+    if rng.random() < 0.35:
+        return
+    place = room.place
+    wide = rng.uniform(1.2, 2.6)
+    deep = wide * rng.uniform(0.55, 0.8)
+    if round(angle / 90) % 2:
+        wide, deep = deep, wide
+    x0 = max(0.05, middle[0] - wide / 2)
+    y0 = max(0.05, middle[1] - deep / 2)
+    x1 = min(place.width - 0.05, middle[0] + wide / 2)
+    y1 = min(place.depth - 0.05, middle[1] + deep / 2)
+    if x1 - x0 < 0.6 or y1 - y0 < 0.6:
+        return
+    room.parts.append(
+        box((x0, y0, 0.0), (x1, y1, 0.012), material_of(room.surface("rug", "rug", "carpet")))
+    )
+
+
+def _bookcase(room: Builder) -> None:
+    """A bookcase with books at a wall, with small things on its free places."""
+    rng = room.rng
+    place = room.place
+    wood = room.surface("wood", "wood", "plaster")
+    shelf = made_shelf(rng, material_of(wood), wood.tile_m)
+    library = room.furniture.of("bookcase")
+    if not library:
+        return
+    # It is placed as a model of its size would be, and then replaced by its own mesh.
+    entry = dataclasses.replace(
+        library[0].entry,
+        key="made#shelf",
+        size_m=(shelf.width, shelf.depth, shelf.height),
+        elevation_m=0.0,
+        top_m=shelf.height,
+    )
+    stand_in = dataclasses.replace(library[0], entry=entry)
+    thing = place.at_wall([stand_in])
+    if thing is None:
+        return
+    turn = rotation_z(thing.angle)
+    back = turn @ np.array([0, shelf.depth / 2, 0])
+    room.parts.append(shelf.mesh.moved(turn, [thing.x + back[0], thing.y + back[1], 0.0]))
+    find = room.furniture.of
+    things = find("vase") + find("small_plant") + find("living_small") + find("toy")
+    for left, right, level in shelf.free:
+        model = things[int(rng.integers(len(things)))] if things else None
+        if model is None or rng.random() < 0.35:
+            continue
+        wide, deep, high = model.entry.size_m
+        if wide > right - left or deep > shelf.depth or high > 0.28:
+            continue
+        x, y = thing.beside((left + right) / 2, 0.0)
+        place.things.append(Placed(model, x, y, level, thing.angle + rng.normal(0, 15)))
+    place.on_top(thing, things, int(rng.integers(0, 3)))
+
+
+def _pendant(room: Builder, x: float, y: float) -> None:
+    """A lamp that hangs from the ceiling."""
+    models = room.furniture.of("pendant")
+    if not models:
+        return
+    model = models[int(room.rng.integers(len(models)))]
+    z = room.place.height - model.entry.size_m[2]
+    if z > 1.4:
+        room.place.things.append(Placed(model, x, y, z, float(room.rng.uniform(0, 360))))
+
+
+def _build_shell(room: Builder) -> None:
+    """Floor, ceiling, walls, skirting, frames, doors and curtains."""
+    rng = room.rng
+    place = room.place
+    wet = room.kind in ("bathroom", "kitchen")
+    floor = room.surface("tiles", "marble", "tiles") if wet and rng.random() < 0.7 else room.surface(
+        "planks", "planks", "parquet", "tiles", "carpet", "concrete", "marble"
+    )
+    wall = room.surface("plaster", "plaster", "plaster", "wallpaper", "brick" if rng.random() < 0.3 else "plaster")
+    if room.kind == "bathroom":
+        wall = room.surface("wall_tiles")
+    accent = room.surface("plaster", "wallpaper", "brick", "concrete") if rng.random() < 0.35 else wall
+    width, depth, height = place.width, place.depth, place.height
+
+    turned = rng.random() < 0.5
+    sides = ((width, 0, 0), (0, depth, 0))
+    if turned:
+        floor_mesh = quad((width, 0, 0), sides[1], (-width, 0, 0), material_of(floor), (floor.tile_m,) * 2)
+    else:
+        floor_mesh = quad((0, 0, 0), *sides, material_of(floor), (floor.tile_m,) * 2)
+    room.parts.append(floor_mesh)
+    ceiling = Material((0.95, 0.95, 0.94)) if rng.random() < 0.85 else material_of(room.surface("wood", "plaster"))
+    room.parts.append(quad((0, depth, height), (width, 0, 0), (0, -depth, 0), ceiling, (1.5, 1.5)))
+    _beams(room)
+
+    shade = rng.choice([0.93, 0.9, 0.6, 0.3])
+    trim = Material((shade, shade * rng.uniform(0.85, 1), shade * rng.uniform(0.7, 1)), specular=0.04, roughness=0.4)
+    accent_wall = WALLS[int(rng.integers(4))]
+    skirting = rng.uniform(0.05, 0.14)
+    rail = room.kind in ("dining", "living", "office") and rng.random() < 0.2
+    for name in WALLS:
+        frame = WallFrame(place, name)
+        length = place.length(name)
+        mine = [one for one in place.openings if one.wall == name]
+        skin = accent if name == accent_wall else wall
+        room.parts += wall_with_openings(frame, length, height, mine, material_of(skin), skin.tile_m)
+        if room.kind != "bathroom":
+            room.parts += strip(frame, length, mine, 0, skirting, 0.015, trim)
+        if rail:
+            room.parts += strip(frame, length, mine, 0.9, 0.96, 0.02, trim)
+        for opening in mine:
+            if opening.kind == "window":
+                paint = trim if rng.random() < 0.3 else Material(WHITE, specular=0.04, roughness=0.4)
+                room.parts += window_frame(rng, frame, opening, paint)
+                _curtains(room, frame, opening, length)
+            else:
+                room.parts += door_way(frame, opening, trim)
+                _behind(room, frame, opening)
+    room.parts += _outer_shell(place)
+
+
+def _outer_shell(place: Place) -> list[Mesh]:
+    """The ground outside, which lights the room from below the window."""
+    ground = Material((0.5, 0.5, 0.45))
+    far = 30.0
+    return [quad((-far, -far, -0.6), (2 * far, 0, 0), (0, 2 * far, 0), ground)]
+
+
+def _beams(room: Builder) -> None:
+    """Beams under the ceiling of some rooms."""
+    rng = room.rng
+    place = room.place
+    if rng.random() > 0.1 or place.height < 2.5:
+        return
+    wood = room.surface("wood")
+    count = int(place.depth / rng.uniform(0.6, 1.1))
+    for number in range(count):
+        y = (number + 0.5) * place.depth / count
+        low = (0.0, y - 0.06, place.height - 0.14)
+        high = (place.width, y + 0.06, place.height)
+        room.parts.append(box(low, high, material_of(wood), (wood.tile_m,) * 2))
+
+
+def _curtains(room: Builder, frame: WallFrame, opening: Opening, length: float) -> None:
+    """Curtains at both sides of a window, on a rod."""
+    rng = room.rng
+    if rng.random() < 0.45:
+        return
+    cloth = room.surface("fabric", "fabric", "plaster")
+    material = material_of(cloth)
+    low = 0.03 if rng.random() < 0.6 else max(0.03, opening.bottom - 0.15)
+    high = min(room.place.height - 0.04, opening.top + 0.12)
+    wide = opening.width * rng.uniform(0.15, 0.4)
+    away = 0.14
+    left = max(0.02, opening.start - 0.2)
+    right = min(length - 0.02, opening.start + opening.width + 0.2)
+    room.parts.append(curtain(rng, frame, left, left + wide, low, high, away, material, cloth.tile_m))
+    room.parts.append(curtain(rng, frame, right - wide, right, low, high, away, material, cloth.tile_m))
+    rod = Material((0.25, 0.22, 0.2), specular=0.2, roughness=0.3)
+    room.parts.append(frame.block(left - 0.03, right + 0.03, high - 0.01, high + 0.015, -away - 0.012, -away + 0.012, rod))
+
+
+def _behind(room: Builder, frame: WallFrame, opening: Opening) -> None:
+    """A closed door, or what one sees through a passage: a corridor or another room."""
+    rng = room.rng
+    if opening.kind == "door":
+        doors = room.furniture.of("door")
+        left = opening.start
+        right = opening.start + opening.width
+        paint = Material(WHITE if rng.random() < 0.5 else (0.5, 0.33, 0.2), specular=0.04, roughness=0.4)
+        if doors and rng.random() < 0.0:
+            return
+        room.parts.append(frame.block(left, right, 0.005, opening.top, 0.04, 0.08, paint))
+        for low, high in ((0.15, 0.8), (1.0, opening.top - 0.15)):  # panels
+            for start, end in ((left + 0.1, (left + right) / 2 - 0.04), ((left + right) / 2 + 0.04, right - 0.1)):
+                room.parts.append(frame.block(start, end, low, high, 0.03, 0.04, paint))
+        knob = Material((0.7, 0.65, 0.5), specular=0.4, roughness=0.25)
+        room.parts.append(frame.block(right - 0.12, right - 0.06, 1.0, 1.03, -0.03, 0.04, knob))
+        return
+
+    # The next room: a box behind the wall, with a lamp of its own and some furniture.
+    reach = rng.uniform(1.2, 4.0)
+    left = opening.start - rng.uniform(0.1, 1.5)
+    right = opening.start + opening.width + rng.uniform(0.1, 1.5)
+    wall = room.surface("plaster", "plaster", "wallpaper")
+    floor = room.surface("planks", "tiles", "parquet", "carpet")
+    skin = material_of(wall)
+    height = room.place.height
+    inner = WALL_M
+    outer = WALL_M + reach
+    parts = [
+        frame.block(left, right, 0, height, outer, outer + 0.01, skin, wall.tile_m),
+        frame.block(left - 0.01, left, 0, height, inner, outer, skin, wall.tile_m),
+        frame.block(right, right + 0.01, 0, height, inner, outer, skin, wall.tile_m),
+        frame.block(left, right, -0.01, 0.0, 0.0, outer, material_of(floor), floor.tile_m),
+        frame.block(left, right, height, height + 0.01, inner, outer, Material((0.94, 0.94, 0.93))),
+        frame.block(left, opening.start, 0, height, inner - 0.005, inner, skin, wall.tile_m),
+        frame.block(opening.start + opening.width, right, 0, height, inner - 0.005, inner, skin, wall.tile_m),
+        frame.block(opening.start, opening.start + opening.width, opening.top, height, inner - 0.005, inner, skin),
+    ]
+    room.parts += parts
+    middle = frame.point((left + right) / 2, height - 0.35, inner + reach / 2)
+    glow = np.array([1.0, 0.9, 0.75]) * rng.uniform(0.3, 2.0)
+    room.lamps.append(((middle[0], middle[1], middle[2]), 0.12, glow))
+    groups = ("sideboard", "floor_plant", "chair", "bookcase", "floor_clutter", "wardrobe", "person")
+    for _ in range(3):
+        models = room.furniture.of(groups[int(rng.integers(len(groups)))])
+        if not models:
+            continue
+        model = models[int(rng.integers(len(models)))]
+        wide, deep, _ = model.entry.size_m
+        along = rng.uniform(left, right)
+        if deep + 0.1 > reach or along - wide / 2 < left or along + wide / 2 > right:
+            continue
+        x, y, _ = frame.point(along, 0, outer - deep / 2 - 0.03)
+        inwards = math.degrees(math.atan2(-float(frame.out[1]), -float(frame.out[0]))) + 90
+        thing = Placed(model, x, y, model.entry.elevation_m, inwards)
+        if not any(thing.box.meets(other.box) for other in room.place.things):
+            room.place.things.append(thing)
+
+
+def _hang_pictures(room: Builder) -> None:
+    """Framed photos on free parts of the walls."""
+    rng = room.rng
+    place = room.place
+    for _ in range(int(rng.choice([0, 1, 2, 4, 7], p=[0.15, 0.2, 0.3, 0.2, 0.15]))):
+        wall = WALLS[int(rng.integers(4))]
+        wide = rng.uniform(0.18, 1.1)
+        high = wide * rng.uniform(0.65, 1.4)
+        height = rng.uniform(1.35, 1.75)
+        if high > 1.2 or wide > place.length(wall) - 0.2 or height + high / 2 > place.height - 0.1:
+            continue
+        middle = rng.uniform(wide / 2 + 0.05, place.length(wall) - wide / 2 - 0.05)
+        blocked = any(
+            one.wall == wall
+            and middle - wide / 2 < one.start + one.width + 0.25
+            and middle + wide / 2 > one.start - 0.25
+            for one in place.openings
+        )
+        frame = WallFrame(place, wall)
+        one = np.array(frame.point(middle - wide / 2 - 0.05, height - high / 2 - 0.05, -0.04))
+        other = np.array(frame.point(middle + wide / 2 + 0.05, height + high / 2 + 0.05, 0.0))
+        low = np.minimum(one, other)
+        top = np.maximum(one, other)
+        from worlds.placing import Box
+
+        region = Box(low[0], low[1], top[0], top[1], low[2], top[2])
+        if blocked or any(region.meets(taken) for taken in place.taken):
+            continue
+        place.taken.append(region)
+        room.parts += picture_frame(rng, frame, middle, height, (wide, high), room.photo_material())
+
+
+def _mesh_of(room: Builder, thing: Placed, shines: bool) -> Mesh:
+    """A thing's triangles in the room, with a new skin where its own is plain grey."""
+    if thing.model.entry.key == "made#shelf":
+        return quad((0, 0, -5), (0.01, 0, 0), (0, 0.01, 0), Material())  # its mesh is there already
+    mesh = room.furniture.library.mesh(thing.model)
+    materials = [_skinned(room, thing, material) for material in mesh.materials]
+    if shines:
+        materials = [_shining(material) for material in materials]
+    mesh = mesh.with_materials(materials)
+    plain = [m.texture is None for m in mesh.materials]
+    skinned = [new.texture is not None and old for new, old in zip(materials, plain, strict=True)]
+    del skinned
+    turn = rotation_z(thing.angle) * thing.scale
+    return _with_box_uv(mesh, thing, room).moved(turn, (thing.x, thing.y, thing.z))
+
+
+MADE_SKIN = "made-skin:"  # marks materials whose texture coordinates are made, too
+
+
+def _skinned(room: Builder, thing: Placed, material: Material) -> Material:
+    """The material, or another one if it is an untextured grey."""
+    rng = room.rng
+    if material.texture is not None or material.opacity < 0.6 or material.specular > 0.3:
+        return material
+    high = max(material.color)
+    low = min(material.color)
+    if high - low > NEUTRAL_SATURATION or high < 0.25 or rng.random() > SKIN_SHARE:
+        return _toned(rng, material)
+    size = max(thing.model.entry.size_m)
+    if size < 0.4:
+        hue = np.clip(rng.random(3) * rng.uniform(0.3, 1.0) + 0.1, 0.05, 0.92)
+        red, green, blue = (float(value) for value in hue)
+        return dataclasses.replace(material, color=(red, green, blue), specular=0.05, roughness=0.25)
+    soft = any(thing.model in room.furniture.of(group) for group in SOFT_GROUPS)
+    if soft:
+        return material_of(room.surface("fabric", "fabric", "carpet"))
+    if room.kind == "bathroom" or rng.random() < 0.35:
+        return _toned(rng, material)
+    return material_of(room.surface("wood", "wood", "plaster"))
+
+
+def _toned(rng: Rng, material: Material) -> Material:
+    """The material in a little different colour."""
+    shift = np.clip(np.array(material.color) * rng.uniform(0.8, 1.1) + rng.normal(0, 0.02, 3), 0.02, 0.95)
+    red, green, blue = (float(value) for value in shift)
+    return dataclasses.replace(material, color=(red, green, blue))
+
+
+def _shining(material: Material) -> Material:
+    """A lamp's bright materials shine; its foot does not."""
+    bright = material.texture is None and min(material.color) > 0.45
+    is_shade = bright or material.opacity < 0.95
+    return dataclasses.replace(material, emission=2.5, opacity=1.0) if is_shade else material
+
+
+def _with_box_uv(mesh: Mesh, thing: Placed, room: Builder) -> Mesh:
+    """The mesh with texture coordinates in metres on triangles whose texture is a made surface.
+
+    Each triangle is seen along the axis it faces most.
+    """
+    folder = str(room.cache)
+    tiles = np.array(
+        [
+            1.0 if m.texture is not None and m.texture.startswith(folder) else 0.0
+            for m in mesh.materials
+        ]
+    )
+    chosen = tiles[mesh.material] > 0
+    if not chosen.any():
+        return mesh
+    normals = np.abs(mesh.normals[chosen].mean(1))
+    axis = normals.argmax(1)
+    corners = mesh.corners[chosen] * thing.scale / 0.6  # a repeat of 60 cm, as cloth and wood have
+    first = np.where(axis == 0, 1, 0)
+    second = np.where(axis == 2, 1, 2)
+    rows = np.arange(len(corners))
+    planar = np.stack(
+        [corners[rows[:, None], np.arange(3)[None], first[:, None]], corners[rows[:, None], np.arange(3)[None], second[:, None]]],
+        -1,
+    )
+    uv = mesh.uv.copy()
+    uv[chosen] = planar
+    return dataclasses.replace(mesh, uv=uv)
+
+
+def _light(room: Builder) -> Lights:
+    """Day or evening: the sun through the windows, the sky behind them, and lamps."""
+    rng = room.rng
+    place = room.place
+    evening = rng.random() < 0.22
+    azimuth = rng.uniform(0, 2 * math.pi)
+    windows = [one for one in place.openings if one.kind == "window"]
+    if windows and rng.random() < 0.65:
+        # The sun shines into a window, more or less along its axis.
+        frame = WallFrame(place, windows[0].wall)
+        azimuth = math.atan2(frame.out[1], frame.out[0]) + rng.normal(0, 0.6)
+    elevation = math.radians(rng.uniform(12, 60))
+    sun = np.array(
+        [
+            math.cos(elevation) * math.cos(azimuth),
+            math.cos(elevation) * math.sin(azimuth),
+            math.sin(elevation),
+        ],
+        np.float32,
+    )
+    backdrop = room.photo(rng) if room.photo is not None and rng.random() < 0.8 else None
+    sky = made_sky(rng, sun, backdrop)
+    warm = np.array([1.0, 0.9, 0.75]) ** rng.uniform(0.3, 2.0)
+    strength = 0.0 if rng.random() < 0.4 else rng.uniform(4, 16)
+    brightness = rng.uniform(0.7, 1.5)
+    if evening:
+        brightness = rng.uniform(0.005, 0.08)
+        strength = 0.0
+    portals = []
+    for opening in windows:
+        frame = WallFrame(place, opening.wall)
+        corner = frame.point(opening.start, opening.bottom, 0.05)
+        portals.append([corner, (opening.width * frame.along), ((opening.top - opening.bottom) * frame.up)])
+
+    _switch_on(room, evening)
+    count = len(room.lamps)
+    return Lights(
+        sky=(sky * brightness).astype(np.float32),
+        sun_direction=sun,
+        sun_color=(warm * strength).astype(np.float32),
+        sun_spread=0.006 if rng.random() < 0.7 else 0.03,
+        portals=np.array([[np.asarray(p, np.float64) for p in one] for one in portals], np.float64).reshape(-1, 3, 3).astype(np.float32),
+        lamp_positions=np.array([lamp[0] for lamp in room.lamps], np.float32).reshape(count, 3),
+        lamp_radii=np.array([lamp[1] for lamp in room.lamps], np.float32),
+        lamp_colors=np.array([lamp[2] for lamp in room.lamps], np.float32).reshape(count, 3),
+    )
+
+
+def _switch_on(room: Builder, evening: bool) -> None:
+    """Lamps of the room that shine: most in the evening, few by day."""
+    rng = room.rng
+    place = room.place
+    lamp_groups = ("table_lamp", "pendant", "floor_lamp")
+    lamps = {model.entry.key for group in lamp_groups for model in room.furniture.of(group)}
+    for number, thing in enumerate(place.things):
+        if thing.model.entry.key in lamps and rng.random() < (0.8 if evening else 0.3):
+            height = thing.model.entry.size_m[2]
+            at = 0.75 if thing.z < 1.2 else 0.2  # the bulb is in the upper part, or hangs
+            radius = min(0.16, 0.45 * min(thing.model.entry.size_m[:2]))
+            color = np.array([1.0, 0.78, 0.5]) * rng.uniform(0.4, 1.2)
+            room.lamps.append(((thing.x, thing.y, thing.z + at * height), radius, color))
+            room.lit.add(number)
+    if evening or rng.random() < 0.25 or not any(o.kind == "window" for o in place.openings):
+        # A ceiling lamp: a disc of milky glass.
+        x = place.width * rng.uniform(0.4, 0.6)
+        y = place.depth * rng.uniform(0.4, 0.6)
+        radius = rng.uniform(0.1, 0.2)
+        z = place.height
+        glow = Material((0.95, 0.93, 0.88), emission=3.0)
+        room.parts.append(box((x - radius, y - radius, z - 0.06), (x + radius, y + radius, z - 0.001), glow))
+        warm = np.array([1.0, rng.uniform(0.75, 0.97), rng.uniform(0.5, 0.95)])
+        room.lamps.append(((x, y, z - 0.18), 0.1, warm * rng.uniform(1.5, 4.0)))

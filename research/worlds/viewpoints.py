@@ -1,0 +1,195 @@
+"""Cameras as people hold them, and second cameras along the package's trajectories."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from worlds.caster import World
+from worlds.placing import Place
+
+from spackle.core.camera import Camera
+from spackle.core.focal_length import focal_mm_to_px
+from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory_cameras
+
+Rng = np.random.Generator
+Floats = NDArray[np.float32]
+CANDIDATES = 14  # cameras from which the best is taken
+PROBE = (18, 24)  # rays of a candidate
+SECOND_VIEWS = 6
+PATH_FRAMES = 24
+DISPARITIES = (0.1, 0.6)  # of the second cameras; the paper's settings are 0.3 to 0.5
+MIN_NEAR_M = 0.22  # nearer things fill the picture with blur
+
+
+@dataclasses.dataclass(frozen=True)
+class Viewpoint:
+    """The photo's camera in a room: its place, and its axes as OpenCV has them."""
+
+    eye: Floats  # [3]
+    axes: Floats  # [3, 3] rows: right, down and forward in the room
+    camera: Camera  # at the origin of its own coordinates
+
+    def rays(self, view: Camera, pixels: Floats) -> tuple[Floats, Floats]:
+        """Origins and directions [N, 3] in the room, of depth 1, through pixels [N, 2].
+
+        Args:
+            view: a camera in the photo's coordinates.
+            pixels: x and y; pixel centres lie at half-integers.
+        """
+        inverse = np.linalg.inv(view.K.double().numpy())
+        rotation = view.world_to_camera[:3, :3].double().numpy()
+        shift = view.world_to_camera[:3, 3].double().numpy()
+        homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], 1)
+        directions = homogeneous @ inverse.T @ rotation @ self.axes
+        center = self.eye + (-rotation.T @ shift) @ self.axes
+        origins = np.broadcast_to(center, directions.shape)
+        return (
+            np.ascontiguousarray(origins, np.float32),
+            np.ascontiguousarray(directions, np.float32),
+        )
+
+
+def pixel_grid(height: int, width: int) -> Floats:
+    """[H · W, 2] x and y of all pixel centres, row by row."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    return np.stack([x.reshape(-1), y.reshape(-1)], -1).astype(np.float32)
+
+
+def choose_viewpoint(
+    rng: Rng, place: Place, world: World, height: int, width: int
+) -> Viewpoint | None:
+    """The best of some random cameras in a room: near and far things, not one wall alone.
+
+    None if all of them stand in furniture.
+    """
+    best = None
+    best_score = -math.inf
+    for _ in range(CANDIDATES):
+        candidate = _random_viewpoint(rng, place, height, width)
+        score = _score(world, candidate)
+        if score > best_score:
+            best = candidate
+            best_score = score
+    return best if best_score > 0 else None
+
+
+def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpoint:
+    """A camera at some height, held a little crooked, that looks at a thing or across the room."""
+    # 24 to 70 mm; phones have 24 to 28 mm.
+    focal_mm = 24 * (70 / 24) ** (rng.random() ** 1.6)
+    camera = Camera.from_focal(focal_mm_to_px(focal_mm, width, height), width, height)
+    eye_height = float(rng.choice([rng.uniform(1.3, 1.7), rng.uniform(0.8, 1.3), rng.uniform(0.35, 0.8)], p=[0.6, 0.3, 0.1]))
+    edge = 0.25
+    x = rng.uniform(edge, place.width - edge)
+    y = rng.uniform(edge, place.depth - edge)
+    if rng.random() < 0.6:  # from a wall or corner, as one does to get the room into the picture
+        if rng.random() < 0.5:
+            x = edge if rng.random() < 0.5 else place.width - edge
+        else:
+            y = edge if rng.random() < 0.5 else place.depth - edge
+    eye = np.array([x, y, min(eye_height, place.height - 0.3)])
+
+    target = np.array([place.width / 2, place.depth / 2, 0.8])
+    if place.things and rng.random() < 0.75:
+        box = place.things[int(rng.integers(len(place.things)))].box
+        target = np.array([(box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2, (box.z0 + box.z1) / 2])
+        target[2] = 0.5 * target[2] + 0.5 * (eye[2] - 0.25)
+    target = target + rng.normal(0, 0.25, 3)
+    forward = target - eye
+    flat = max(float(np.hypot(forward[0], forward[1])), 0.3)
+    pitch = np.clip(math.atan2(forward[2], flat), -0.6, 0.2)
+    azimuth = math.atan2(forward[1], forward[0])
+    roll = math.radians(rng.normal(0, 1.5))
+    return Viewpoint(eye.astype(np.float32), _axes(azimuth, float(pitch), roll), camera)
+
+
+def _axes(azimuth: float, pitch: float, roll: float) -> Floats:
+    """[3, 3] rows right, down and forward of a camera that looks along an azimuth, upwards by
+    `pitch`, and is rolled clockwise.
+    """
+    forward = np.array(
+        [math.cos(pitch) * math.cos(azimuth), math.cos(pitch) * math.sin(azimuth), math.sin(pitch)]
+    )
+    right = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
+    down = np.cross(forward, right)
+    c, s = math.cos(roll), math.sin(roll)
+    return np.stack([c * right + s * down, c * down - s * right, forward]).astype(np.float32)
+
+
+def _score(world: World, viewpoint: Viewpoint) -> float:
+    """How much a camera shows: many surfaces at many depths; negative where it is blocked."""
+    rows, columns = PROBE
+    camera = viewpoint.camera.resized(columns, rows)
+    origins, directions = viewpoint.rays(camera, pixel_grid(rows, columns))
+    hits = world.first_hits(origins, directions)
+    depth = hits.distance[hits.triangle >= 0]
+    if len(depth) < 0.5 * rows * columns or np.quantile(depth, 0.01) < MIN_NEAR_M:
+        return -1.0
+    if np.quantile(depth, 0.3) < 0.7:  # something fills the picture
+        return -0.5
+    materials = world.mesh.material[hits.triangle[hits.triangle >= 0]]
+    kinds = np.bincount(materials)
+    shares = kinds[kinds > 0] / len(materials)
+    variety = float(-(shares * np.log(shares)).sum())
+    spread = float(np.log(depth).std())
+    openness = 1 - len(depth) / (rows * columns)
+    return variety + 1.5 * min(spread, 0.7) + 0.3 * min(float(np.median(depth)), 4) - 2 * openness
+
+
+def second_cameras(
+    rng: Rng, world: World, viewpoint: Viewpoint, depth: Floats
+) -> tuple[list[Camera], list[str]]:
+    """Six cameras along trajectories of the package, and what each is; none inside of a thing.
+
+    Args:
+        rng: chooses trajectories, disparities and frames.
+        world: to look for obstacles.
+        viewpoint: the photo's.
+        depth: [N] known depths of the photo.
+    """
+    near, focus = np.quantile(depth, [0.001, 0.1])
+    depth_range = DepthRange(near=float(near), focus=max(2.0, float(focus)))
+    cameras = []
+    names = []
+    while len(cameras) < SECOND_VIEWS:
+        kind = SHARP_TRAJECTORIES[int(rng.integers(len(SHARP_TRAJECTORIES)))]
+        disparity = float(rng.uniform(*DISPARITIES))
+        frame = int(rng.integers(PATH_FRAMES))
+        if kind == "swipe" and rng.random() < 0.5:
+            frame = 0 if rng.random() < 0.5 else PATH_FRAMES - 1  # its ends, as the paper has them
+        # A path that runs into a thing is shortened.
+        for _ in range(6):
+            (camera,) = trajectory_cameras(
+                kind, viewpoint.camera, disparity, depth_range, PATH_FRAMES, only=frame
+            )
+            if _is_free(world, viewpoint, camera):
+                break
+            disparity *= 0.6
+        cameras.append(dataclasses.replace(camera, world_to_camera=camera.world_to_camera.float()))
+        names.append(f"{kind} {disparity:.2f} {frame}/{PATH_FRAMES}")
+    return cameras, names
+
+
+def _is_free(world: World, viewpoint: Viewpoint, camera: Camera) -> bool:
+    """Whether a second camera can be reached in a straight line, and has some room in front."""
+    step = camera.position.double().numpy() @ viewpoint.axes
+    length = float(np.linalg.norm(step))
+    if length < 1e-6:
+        return True
+    origin = viewpoint.eye[None].astype(np.float32)
+    direction = (step / length)[None].astype(np.float32)
+    if world.blocked(origin, direction, np.array([length + 0.1], np.float32))[0]:
+        return False
+    small = camera.resized(12, 9)
+    origins, directions = viewpoint.rays(small, pixel_grid(9, 12))
+    hits = world.first_hits(origins, directions)
+    return bool(np.quantile(hits.distance, 0.02) > 0.5 * MIN_NEAR_M)
+
+
+def camera_tensor(values: Floats) -> torch.Tensor:
+    """A float tensor of an array."""
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))

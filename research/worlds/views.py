@@ -1,0 +1,276 @@
+"""Pictures of a world: linear colour, depth and normals at the photo's camera and beside it.
+
+Colour has smooth edges: pixels at outlines and at borders of sunlight are the mean of several
+rays. Depth, normal and validity are those of the one surface in the middle of the pixel.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+from worlds.caster import NUDGE_M, Hits, World
+from worlds.irradiance import Irradiance, solve, sun_on, tangents
+from worlds.lights import Lights
+from worlds.viewpoints import Viewpoint, pixel_grid
+
+from spackle.core.camera import Camera
+
+Rng = np.random.Generator
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+EDGE_RAYS = 4  # further rays of a pixel at an edge
+EDGE_COSINE = 0.93  # neighbours of one surface have normals at less than 22 degrees
+EDGE_RATIO = 0.02  # neighbours of one surface are this near to each other's plane, in depths
+COARSE_M = 0.22  # width of coarse cells of light in rooms
+SHINY = 0.45  # surfaces rougher than this show no reflections
+GLASS_SHINE = 0.1  # share of light that panes reflect; it comes from the room's mean
+MAX_RADIANCE = 12.0  # brighter rays would make edges hard again
+VALID, FAR, UNSURE = 1, 2, 0  # values of the validity mask
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """What a camera sees."""
+
+    camera: Camera  # in the photo's coordinates
+    radiance: Floats  # [H, W, 3] linear, in units of a white sky
+    depth: Floats  # [H, W] metres along the camera's axis, inf for the sky
+    normal: Floats  # [H, W, 3] unit vectors in this camera's axes, 0 for the sky
+    valid: NDArray[np.uint8]  # [H, W] 1: a surface; 2: the sky; 0: seen through glass
+
+
+@dataclasses.dataclass
+class _Traced:
+    """The rays through the middles of a view's pixels."""
+
+    camera: Camera
+    origins: Floats
+    directions: Floats
+    hits: Hits
+    smooth: Floats
+    flat: Floats
+    positions: Floats
+
+
+def render(
+    rng: Rng, world: World, lights: Lights, viewpoint: Viewpoint, cameras: list[Camera]
+) -> list[View]:
+    """The views of a world from several cameras, lit alike.
+
+    Args:
+        rng: directions of rays.
+        world, lights: the world.
+        viewpoint: the photo's camera.
+        cameras: the views' cameras, in the photo's coordinates.
+    """
+    traced = [_trace(world, viewpoint, camera) for camera in cameras]
+    met = [one.hits.triangle >= 0 for one in traced]
+    focal_px = viewpoint.camera.focal[0]
+    irradiance = solve(
+        world,
+        lights,
+        rng,
+        np.concatenate([one.positions[m] for one, m in zip(traced, met, strict=True)]),
+        np.concatenate([one.smooth[m] for one, m in zip(traced, met, strict=True)]),
+        viewpoint.eye,
+        focal_px,
+        COARSE_M,
+    )
+    return [_finished(rng, world, lights, irradiance, viewpoint, one) for one in traced]
+
+
+def _trace(world: World, viewpoint: Viewpoint, camera: Camera) -> _Traced:
+    """Send one ray through the middle of each pixel."""
+    origins, directions = viewpoint.rays(camera, pixel_grid(camera.height, camera.width))
+    return _traced(world, camera, origins, directions)
+
+
+def _traced(world: World, camera: Camera, origins: Floats, directions: Floats) -> _Traced:
+    """Where rays end, and the surfaces there."""
+    hits = world.first_hits(origins, directions)
+    smooth, flat = world.normals(hits, directions)
+    reach = np.where(hits.triangle >= 0, hits.distance, 0.0)[:, None]
+    positions = (origins + reach * directions).astype(np.float32)
+    return _Traced(camera, origins, directions, hits, smooth, flat, positions)
+
+
+def _finished(
+    rng: Rng,
+    world: World,
+    lights: Lights,
+    irradiance: Irradiance,
+    viewpoint: Viewpoint,
+    middle: _Traced,
+) -> View:
+    """A view with smooth edges."""
+    camera = middle.camera
+    shape = (camera.height, camera.width)
+    colors, sunlit = _shaded(rng, world, lights, irradiance, camera, middle)
+    edges = _edges(middle, sunlit, shape).reshape(-1)
+    chosen = np.flatnonzero(edges)
+    if len(chosen):
+        total = np.minimum(colors[chosen], MAX_RADIANCE)
+        centers = pixel_grid(*shape)[chosen]
+        for number in range(EDGE_RAYS):
+            # One ray in each quarter of the pixel.
+            quarter = np.array([number % 2, number // 2 % 2]) / 2 - 0.5
+            pixels = centers + quarter + rng.random((len(chosen), 2)) / 2
+            rays = viewpoint.rays(camera, pixels.astype(np.float32))
+            more = _traced(world, camera, *rays)
+            extra, _ = _shaded(rng, world, lights, irradiance, camera, more)
+            total += np.minimum(extra, MAX_RADIANCE)
+        colors[chosen] = total / (EDGE_RAYS + 1)
+
+    found = middle.hits.triangle >= 0
+    rotation = camera.world_to_camera[:3, :3].numpy() @ viewpoint.axes
+    normal = (middle.smooth @ rotation.T).astype(np.float32)
+    valid = np.where(found, VALID, FAR).astype(np.uint8)
+    valid[(middle.hits.passed < 1) & found] = UNSURE
+    # A ray has depth one, so distances along it are depths.
+    return View(
+        camera,
+        colors.reshape(*shape, 3),
+        middle.hits.distance.reshape(shape),
+        normal.reshape(*shape, 3),
+        valid.reshape(shape),
+    )
+
+
+def _edges(middle: _Traced, sunlit: Floats, shape: tuple[int, int]) -> Bools:
+    """[H, W] pixels with another surface or other sunlight beside them."""
+    triangle = middle.hits.triangle.reshape(shape)
+    depth = np.where(triangle >= 0, middle.hits.distance.reshape(shape), 1e6)
+    normal = middle.flat.reshape(*shape, 3)
+    position = middle.positions.reshape(*shape, 3)
+    lit = sunlit.reshape(shape) > 0
+    glass = middle.hits.passed.reshape(shape)
+    edges = np.zeros(shape, bool)
+    for axis in (0, 1):
+        one = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+        other = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
+        turned = (normal[one] * normal[other]).sum(-1) < EDGE_COSINE
+        apart = np.abs(((position[one] - position[other]) * normal[one]).sum(-1))
+        away = apart > EDGE_RATIO * np.minimum(depth[one], depth[other])
+        differs = (triangle[one] < 0) != (triangle[other] < 0)
+        both_sky = (triangle[one] < 0) & (triangle[other] < 0)
+        shade = lit[one] != lit[other]
+        pane = glass[one] != glass[other]
+        edge = ((turned | away) & ~both_sky) | differs | shade | pane
+        edges[one] |= edge
+        edges[other] |= edge
+    return edges
+
+
+def _shaded(
+    rng: Rng,
+    world: World,
+    lights: Lights,
+    irradiance: Irradiance,
+    camera: Camera,
+    traced: _Traced,
+) -> tuple[Floats, Floats]:
+    """Linear colour [N, 3] of rays, and [N] the cosine towards the sun where it shines."""
+    hits = traced.hits
+    count = len(hits.triangle)
+    colors = np.zeros((count, 3), np.float32)
+    sunlit = np.zeros(count, np.float32)
+    lengths = np.linalg.norm(traced.directions, axis=1)
+    unit = (traced.directions / lengths[:, None]).astype(np.float32)
+    found = np.flatnonzero(hits.triangle >= 0)
+    open_sky = np.flatnonzero(hits.triangle < 0)
+    colors[open_sky] = lights.sky_smooth(unit[open_sky])
+    if len(found):
+        part = Hits(
+            hits.triangle[found], hits.distance[found], hits.u[found], hits.v[found], hits.passed[found]
+        )
+        normals = traced.smooth[found]
+        positions = traced.positions[found]
+        towards = -unit[found]
+        facing = np.clip((normals * towards).sum(1), 0.05, 1)
+        # A pixel covers more of a surface that is seen at a grazing angle.
+        footprint = part.distance * lengths[found] / camera.focal[0] / np.sqrt(facing)
+        albedo = world.albedo(part, footprint.astype(np.float32))
+        light = irradiance.at(positions, normals)
+        if lights.sun_color.any():
+            flat = traced.flat[found]
+            # The flat normal decides whether light may come, the smooth one how much.
+            seen = sun_on(world, lights, rng, positions + NUDGE_M * flat, normals)
+            sunlit[found] = seen
+            light = light + seen[:, None] * lights.sun_color
+        material = world.mesh.material[part.triangle]
+        glow = world.emission[material][:, None] * world.color[material]
+        shaded = albedo * light / np.pi + glow
+        shaded = _with_reflections(
+            rng, world, lights, irradiance, shaded, part, positions, normals, towards, material
+        )
+        colors[found] = shaded
+    # Panes darken what is behind them, and mirror some of the room.
+    pane = 1 - hits.passed
+    colors = colors * hits.passed[:, None] + pane[:, None] * GLASS_SHINE * irradiance.mean / np.pi
+    return colors.astype(np.float32), sunlit
+
+
+def _with_reflections(
+    rng: Rng,
+    world: World,
+    lights: Lights,
+    irradiance: Irradiance,
+    colors: Floats,
+    hits: Hits,
+    positions: Floats,
+    normals: Floats,
+    towards: Floats,
+    material: NDArray[np.int32],
+) -> Floats:
+    """Colours with what shiny surfaces mirror."""
+    specular = world.specular[material]
+    roughness = world.roughness[material]
+    shiny = np.flatnonzero((specular > 0.01) & (roughness < SHINY))
+    del hits
+    if not len(shiny):
+        return colors
+    n = normals[shiny]
+    v = towards[shiny]
+    rough = roughness[shiny] ** 2
+    # The mirrored ray, spread a little by the roughness.
+    spread = rng.standard_normal((len(shiny), 2)) * rough[:, None] * 0.5
+    first, second = tangents(n)
+    tilted = n + spread[:, :1] * first + spread[:, 1:] * second
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    cosine = (tilted * v).sum(1, keepdims=True)
+    direction = (2 * cosine * tilted - v).astype(np.float32)
+    above = (direction * n).sum(1) > 0.01
+    share = specular[shiny] + (1 - specular[shiny]) * np.clip(1 - cosine[:, 0], 0, 1) ** 5 * (
+        1 - roughness[shiny]
+    )
+    origins = positions[shiny] + _off_surface(n)
+    mirrored = world.first_hits(origins.astype(np.float32), direction)
+    seen = np.flatnonzero((mirrored.triangle >= 0) & above)
+    light = np.zeros((len(shiny), 3), np.float32)
+    if len(seen):
+        part = Hits(
+            mirrored.triangle[seen],
+            mirrored.distance[seen],
+            mirrored.u[seen],
+            mirrored.v[seen],
+            mirrored.passed[seen],
+        )
+        where = (origins[seen] + part.distance[:, None] * direction[seen]).astype(np.float32)
+        side, _ = world.normals(part, direction[seen])
+        own = world.albedo(part, (0.01 + 0.05 * part.distance).astype(np.float32))
+        number = world.mesh.material[part.triangle]
+        glow = world.emission[number][:, None] * world.color[number]
+        light[seen] = own * irradiance.roughly_at(where, side) / np.pi + glow
+    sky = np.flatnonzero((mirrored.triangle < 0) & above)
+    light[sky] = np.minimum(lights.sky_smooth(direction[sky]), 3.0)
+    result = colors.copy()
+    weight = share[:, None]
+    result[shiny] = colors[shiny] * (1 - weight) + light * weight
+    return result
+
+
+def _off_surface(normals: Floats) -> Floats:
+    """[N, 3] a small step off a surface."""
+    return (NUDGE_M * 4 * normals).astype(np.float32)
