@@ -72,7 +72,7 @@ fuzz: $(VENV)/.installed
 	$(BIN)/python tests/fuzz/fuzz.py -n $(N)
 
 test-slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -m slow tests research/lite/tests
+	$(BIN)/python -m pytest -m slow tests research/lite/tests research/worlds/tests
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -9,10 +9,10 @@ import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
-from worlds.meshes import Material, Mesh
-from worlds.pictures import BYTE_TO_LINEAR, Pyramids, fetch, find_pictures, pyramids, srgb_to_linear
 
 from spackle.runtime.kernels import kernel
+from worlds.meshes import Material, Mesh
+from worlds.pictures import BYTE_TO_LINEAR, Pyramids, fetch, find_pictures, pyramids, srgb_to_linear
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -253,7 +253,14 @@ def _texel_density(mesh: Mesh, texture: Ints, pictures: Pyramids) -> Floats:
 
 @kernel
 def _normals(
-    corners: Any, normals: Any, triangle: Any, u: Any, v: Any, directions: Any, smooth: Any, flat: Any
+    corners: Any,
+    normals: Any,
+    triangle: Any,
+    u: Any,
+    v: Any,
+    directions: Any,
+    smooth: Any,
+    flat: Any,
 ) -> None:
     """Write the interpolated and the flat unit normals of hits, both towards the ray's origin."""
     for n in range(triangle.shape[0]):

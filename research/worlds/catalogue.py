@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+
 from worlds.meshes import Mesh
 from worlds.obj_files import read_obj
 

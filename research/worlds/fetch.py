@@ -13,9 +13,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from worlds.library import Library
-
 from spackle.runtime.errors import InputError
+from worlds.library import Library
 
 PACKAGES = ("sweethome3d-furniture", "sweethome3d")
 CATALOGUES = "usr/share/sweethome3d/furniture"

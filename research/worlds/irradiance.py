@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from worlds.caster import NUDGE_M, World
-from worlds.lights import Lights
 
 from spackle.runtime.kernels import kernel
+from worlds.caster import NUDGE_M, World
+from worlds.lights import Lights
 
 Floats = NDArray[np.float32]
 Longs = NDArray[np.int64]
@@ -25,13 +25,16 @@ BASE_CELL_M = 0.01  # width of cells at level 0; each level doubles it
 CELL_PX = 5.0  # width of a cell in the photo
 MAX_LEVEL = 9  # cells of 5 m
 COARSE_LEVEL = 20  # a name for the coarse cells, which have one width everywhere
-GATHER_RAYS = 40  # of a fine cell
+GATHER_RAYS = 32  # of a fine cell
 COARSE_RAYS = 24  # of a coarse cell
 PORTAL_RAYS = 16  # of a cell towards the windows
 LAMP_RAYS = 4  # of a cell towards each lamp
 BOUNCES = 6
-COARSE_SAMPLES = 4  # places of a coarse cell at which sunlight is looked for
+COARSE_SAMPLES = 12  # places at which sunlight is looked for, for each coarse cell on average
 EMPTY = -1
+# Noise of gathered light is about a fifth, and it varies slowly; that of direct light is less.
+GATHERED_STRIDES, GATHERED_TOLERANCE = (1, 2, 3, 1), 0.6
+DIRECT_STRIDES, DIRECT_TOLERANCE = (1, 1), 0.5
 CHUNK = 400_000  # rays at once
 
 
@@ -103,7 +106,7 @@ def cell_levels(positions: Floats, eye: Floats, angle: float) -> Floats:
     """
     distance = np.linalg.norm(positions - eye, axis=1)
     levels = np.log2(np.maximum(distance * angle / BASE_CELL_M, 1e-6))
-    return np.clip(levels, 0, MAX_LEVEL - 1).astype(np.float32)
+    return np.asarray(np.clip(levels, 0, MAX_LEVEL - 1), np.float32)
 
 
 def solve(
@@ -132,7 +135,9 @@ def solve(
     count = len(cells.position)
 
     # Where the rays of fine cells end, there coarse cells are needed.
-    ends, end_normals, end_cell, missed = _gather(world, rng, cells.position, cells.normal, GATHER_RAYS)
+    ends, end_normals, end_cell, missed = _gather(
+        world, rng, cells.position, cells.normal, GATHER_RAYS
+    )
     fixed = coarse_m / 2.0**COARSE_LEVEL
     every = np.full(len(ends), COARSE_LEVEL, np.float32)
     coarse = _cells(ends, end_normals, every, fixed, both_levels=False)
@@ -151,13 +156,13 @@ def solve(
     sky = _sky_light(lights, world, rng, coarse.position, coarse.normal, coarse_missed, COARSE_RAYS)
     table = known.reshape(-1, COARSE_RAYS)
     light = direct + sky
-    mean_reflected = (albedo * light).mean(0)
+    mean_reflected = _mean(albedo * light)
     for _ in range(BOUNCES):
         reflected = np.concatenate([albedo * light, mean_reflected[None]])
         seen = np.where(table >= 0, table, len(coarse.position))
         gathered = reflected[seen] * (~coarse_missed.reshape(-1, COARSE_RAYS))[..., None]
         light = direct + sky + gathered.mean(1) + math.pi * lights.ambient
-        mean_reflected = (albedo * light).mean(0)
+        mean_reflected = _mean(albedo * light)
 
     # Fine cells gather from coarse ones.
     fine_link = np.full(len(missed), EMPTY, np.int64)
@@ -166,8 +171,10 @@ def solve(
     gathered = reflected[fine_link.reshape(count, GATHER_RAYS)].mean(1)
     gathered = gathered + math.pi * lights.ambient
     gathered += _sky_light(lights, world, rng, cells.position, cells.normal, missed, GATHER_RAYS)
-    gathered = _smoothed(cells, gathered.astype(np.float32), positions, normals, levels)
-    total = gathered + _direct(world, lights, rng, cells.position, cells.normal)
+    gathered = _smoothed(cells, gathered.astype(np.float32), GATHERED_STRIDES, GATHERED_TOLERANCE)
+    direct = _direct(world, lights, rng, cells.position, cells.normal)
+    direct = _smoothed(cells, direct, DIRECT_STRIDES, DIRECT_TOLERANCE)
+    total = gathered + direct
     return Irradiance(
         cells,
         total.astype(np.float32),
@@ -178,6 +185,11 @@ def solve(
         angle,
         total.mean(0).astype(np.float32),
     )
+
+
+def _mean(values: Floats) -> Floats:
+    """[3] the mean of values [N, 3]; 0 if there are none."""
+    return np.asarray(values.sum(0) / max(1, len(values)), np.float32)
 
 
 def _cells(
@@ -213,7 +225,13 @@ def _gather(
         Positions and normals of the ends [M, 3]; triangle and barycentric weights of the ends;
         and [N · rays] which rays end nowhere.
     """
-    ends, sides, triangles, us, vs, missed = [], [], [], [], [], []
+    # Empty arrays come first, because there may be no points, or no surface around them.
+    ends: list[Floats] = [np.zeros((0, 3), np.float32)]
+    sides: list[Floats] = [np.zeros((0, 3), np.float32)]
+    triangles: list[NDArray[np.int32]] = [np.zeros(0, np.int32)]
+    us: list[Floats] = [np.zeros(0, np.float32)]
+    vs: list[Floats] = [np.zeros(0, np.float32)]
+    missed: list[NDArray[np.bool_]] = [np.zeros(0, bool)]
     step = max(1, CHUNK // rays)
     for first in range(0, len(positions), step):
         part = slice(first, first + step)
@@ -250,7 +268,9 @@ def hemisphere(rng: np.random.Generator, normals: Floats, rays: int) -> Floats:
     z = np.sqrt(np.maximum(0, 1 - number))
     first, second = tangents(normals)
     return np.asarray(
-        x[..., None] * first[:, None] + y[..., None] * second[:, None] + z[..., None] * normals[:, None],
+        x[..., None] * first[:, None]
+        + y[..., None] * second[:, None]
+        + z[..., None] * normals[:, None],
         np.float32,
     )
 
@@ -267,9 +287,7 @@ def tangents(normals: Floats) -> tuple[Floats, Floats]:
     return first.astype(np.float32), second.astype(np.float32)
 
 
-def _coarse_albedo(
-    world: World, coarse: Cells, link: Longs, ends: tuple[Any, Any, Any]
-) -> Floats:
+def _coarse_albedo(world: World, coarse: Cells, link: Longs, ends: tuple[Any, Any, Any]) -> Floats:
     """[C, 3] mean linear colour of the surfaces in coarse cells."""
     triangle, _, _ = ends
     material = world.mesh.material[triangle]
@@ -377,28 +395,28 @@ def _sunlight(
 ) -> Floats:
     """[count, 3] mean irradiance from the sun on coarse cells, at a few points of each."""
     total = np.zeros((count, 3), np.float32)
-    if not lights.sun_color.any():
+    if not lights.sun_color.any() or not count:
         return total
-    order = rng.permutation(len(ends))
-    sorted_order = order[np.argsort(link[order], kind="stable")]
-    cell = link[sorted_order]
-    starts = np.searchsorted(cell, np.arange(count))
-    rank = np.arange(len(cell)) - starts[cell]
-    chosen = sorted_order[rank < COARSE_SAMPLES]
-    seen = sun_on(world, lights, rng, ends[chosen], normals[chosen])
+    # Cells at which many rays end matter more, and get more samples.
+    chosen = rng.integers(len(ends), size=COARSE_SAMPLES * count)
+    spread = rng.standard_normal((len(chosen), 3)) * lights.sun_spread / 2
+    directions = lights.sun_direction + spread
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = sun_on(world, directions.astype(np.float32), ends[chosen], normals[chosen])
     tallies = np.bincount(link[chosen], minlength=count)
     sums = np.bincount(link[chosen], seen, minlength=count) / np.maximum(tallies, 1)
     return np.asarray(sums[:, None] * lights.sun_color, np.float32)
 
 
-def sun_on(
-    world: World, lights: Lights, rng: np.random.Generator, positions: Floats, normals: Floats
-) -> Floats:
-    """[N] cosine towards the sun where it shines, 0 in shadow."""
-    spread = rng.standard_normal((len(positions), 3)) * lights.sun_spread / 2
-    directions = lights.sun_direction + spread
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    directions = directions.astype(np.float32)
+def sun_on(world: World, directions: Floats, positions: Floats, normals: Floats) -> Floats:
+    """[N] cosine towards the sun where it shines, 0 in shadow.
+
+    Args:
+        world: whose surfaces give shadow.
+        directions: [3] or [N, 3] unit vectors towards the sun.
+        positions, normals: [N, 3] points and their unit normals.
+    """
+    directions = np.ascontiguousarray(np.broadcast_to(directions, positions.shape))
     cosine = (directions * normals).sum(1)
     lit = np.zeros(len(positions), np.float32)
     facing = np.flatnonzero(cosine > 0)
@@ -431,14 +449,24 @@ def _sky_light(
     return np.asarray(math.pi * (openness * side)[:, None] * above, np.float32)
 
 
-def _smoothed(
-    cells: Cells, light: Floats, positions: Floats, normals: Floats, levels: Floats
-) -> Floats:
-    """[C, 3] the light of cells, averaged with neighbours of the same surface, against noise."""
-    del positions, normals, levels
-    result = light.copy()
-    _smooth(cells.table, cells.slots, cells.position, cells.normal, light, np.float32(BASE_CELL_M), result)
-    return result
+def _smoothed(cells: Cells, light: Floats, strides: tuple[int, ...], tolerance: float) -> Floats:
+    """[C, 3] the light of cells, averaged with neighbours of the same surface, against noise.
+
+    Args:
+        cells: the cells.
+        light: [C, 3] irradiance.
+        strides: distance to the neighbours in cells, in each round.
+        tolerance: neighbours count less if their light differs by a larger share.
+    """
+    base = np.float32(BASE_CELL_M)
+    for stride in strides:
+        result = light.copy()
+        _smooth(
+            cells.table, cells.slots, cells.position, cells.normal, light, base, stride,
+            np.float32(tolerance), result,
+        )  # fmt: skip
+        light = result
+    return light
 
 
 OFFSET = 1 << 17  # of cell coordinates, so that they are not negative
@@ -466,7 +494,7 @@ def _side(x: float, y: float, z: float) -> int:
 
 
 @kernel
-def _slot(table: Any, key: int) -> int:
+def _slot(table: Any, key: int) -> Any:
     """The place of a key in the table, or the free place where it belongs."""
     mask = table.shape[0] - 1
     mixed = key * 0x1E3779B97F4A7C15
@@ -516,9 +544,7 @@ def _insert(
 
 
 @kernel
-def _lookup(
-    table: Any, slots: Any, positions: Any, normals: Any, base: float, result: Any
-) -> None:
+def _lookup(table: Any, slots: Any, positions: Any, normals: Any, base: float, result: Any) -> None:
     """Write the numbers of coarse cells in which points lie; −1 for none."""
     size = base * 2.0**COARSE_LEVEL
     for n in range(positions.shape[0]):
@@ -635,6 +661,8 @@ def _smooth(
     cell_normal: Any,
     light: Any,
     base: float,
+    stride: int,
+    tolerance: float,
     result: Any,
 ) -> None:
     """Write the mean light of each cell and its 26 neighbours of the same level and side."""
@@ -657,7 +685,9 @@ def _smooth(
         for i in range(-1, 2):
             for j in range(-1, 2):
                 for k in range(-1, 2):
-                    other = _slot(table, _key(level, x + i, y + j, z + k, side))
+                    other = _slot(
+                        table, _key(level, x + stride * i, y + stride * j, z + stride * k, side)
+                    )
                     if table[other] == -1:
                         continue
                     near = slots[other]
@@ -668,17 +698,15 @@ def _smooth(
                     )
                     if agree < 0.7:
                         continue
-                    plane = (
-                        abs(
-                            (cell_position[near, 0] - cell_position[cell, 0]) * cell_normal[cell, 0]
-                            + (cell_position[near, 1] - cell_position[cell, 1])
-                            * cell_normal[cell, 1]
-                            + (cell_position[near, 2] - cell_position[cell, 2])
-                            * cell_normal[cell, 2]
-                        )
-                        / size
-                    )
-                    w = agree**4 / (1.0 + 30.0 * plane * plane)
+                    plane = abs(
+                        (cell_position[near, 0] - cell_position[cell, 0]) * cell_normal[cell, 0]
+                        + (cell_position[near, 1] - cell_position[cell, 1]) * cell_normal[cell, 1]
+                        + (cell_position[near, 2] - cell_position[cell, 2]) * cell_normal[cell, 2]
+                    ) / (size * stride)
+                    own = light[cell, 0] + light[cell, 1] + light[cell, 2]
+                    their = light[near, 0] + light[near, 1] + light[near, 2]
+                    ratio = abs(own - their) / (tolerance * (own + their) / 2 + 1e-6)
+                    w = agree**4 / (1.0 + 30.0 * plane * plane) / (1.0 + ratio**4)
                     red += w * light[near, 0]
                     green += w * light[near, 1]
                     blue += w * light[near, 2]

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from worlds.catalogue import Entry, read_catalogue, read_model
-from worlds.meshes import Material, Mesh
 
 from spackle.runtime.files import atomic_path, write_json
+from worlds.catalogue import Entry, read_catalogue, read_model
+from worlds.meshes import Material, Mesh
 
 INDEX_FILE = "index.json"
 LIBRARY_VERSION = 2  # increases whenever the same catalogues would give other arrays

@@ -11,10 +11,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+
 from worlds.pictures import srgb_to_linear
 
 Floats = NDArray[np.float32]
-SKY_SHAPE = (256, 512)  # rows from the zenith to the nadir, columns around the horizon
+SKY_SHAPE = (512, 1024)  # rows from the zenith to the nadir, columns around the horizon
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +72,9 @@ def sky_directions(shape: tuple[int, int]) -> Floats:
     elevation = (0.5 - y / height) * math.pi
     azimuth = (x / width - 0.5) * 2 * math.pi
     flat = np.cos(elevation)
-    return np.stack(
-        [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1
-    ).astype(np.float32)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1).astype(
+        np.float32
+    )
 
 
 def made_sky(
@@ -102,7 +103,9 @@ def made_sky(
     sky = sky * (1 - cloudiness) + cloudiness * np.array([1.05, 1.05, 1.08])
 
     # Land: two rows of hills, and the ground.
-    skyline = 0.03 + 0.08 * rng.random() * np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), 24))[..., None]
+    skyline = (
+        0.03 + 0.08 * rng.random() * np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), 24))[..., None]
+    )
     ground_color = srgb_to_linear(rng.uniform([0.25, 0.3, 0.15], [0.5, 0.5, 0.4]))
     far_color = ground_color * 0.6 + 0.15
     texture = 1 + 0.35 * cloud_noise(rng, SKY_SHAPE, 40)[..., None]
@@ -110,7 +113,7 @@ def made_sky(
     sky = np.where(up < skyline, land, sky)
     if backdrop is not None:
         sky = _with_backdrop(rng, sky, backdrop)
-    return np.maximum(sky, 0.01).astype(np.float32)
+    return np.asarray(np.maximum(sky, 0.01), np.float32)
 
 
 def _with_backdrop(
@@ -149,7 +152,7 @@ def cloud_noise(
         total += strength * _stretched(rng.standard_normal((rows, columns)), shape)
         strength *= 0.55
         cells *= 2
-    return (total - total.mean()) / max(float(total.std()), 1e-9)
+    return np.asarray((total - total.mean()) / max(float(total.std()), 1e-9))
 
 
 def _stretched(values: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
+Vector = Sequence[float] | NDArray[np.float64]  # [3]
+
 CREASE_COSINE = 0.7  # faces that meet at more than 45 degrees keep an edge between them
 # Points of a model that are closer than this share of its size are one point.
 WELD_RATIO = 1e-5
@@ -135,7 +137,7 @@ def smooth_normals(corners: NDArray[np.floating]) -> Floats:
     # A mean that leans too far from the face would shade it from the wrong side.
     leaning = (result * flat).sum(1) < CREASE_COSINE
     result[leaning] = flat[leaning]
-    return result.reshape(-1, 3, 3).astype(np.float32)
+    return np.asarray(result.reshape(-1, 3, 3), np.float32)
 
 
 _BIN_DIRECTIONS = np.array(
@@ -187,9 +189,9 @@ def rotation_z(degrees: float) -> NDArray[np.float64]:
 
 
 def quad(
-    origin: Sequence[float],
-    side: Sequence[float],
-    other: Sequence[float],
+    origin: Vector,
+    side: Vector,
+    other: Vector,
     material: Material,
     tile_m: tuple[float, float] | None = None,
     uv_offset: tuple[float, float] = (0.0, 0.0),

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
+
 from worlds.caster import World
 from worlds.fetch import open_library
 from worlds.library import Library, Model

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import posixpath
 import re
 from collections.abc import Callable
 
 import numpy as np
+
 from worlds.meshes import Material, Mesh, repaired_normals, smooth_normals
 
 ReadFile = Callable[[str], bytes | None]  # the content of a file by its name, None if missing
@@ -62,7 +64,7 @@ def read_obj(text: str, folder: str, read_file: ReadFile) -> Mesh:
         elif kind == "f":
             counts = (len(points), len(textures), len(normals))
             corners = [_corner(word, counts) for word in words[1:]]
-            for second, third in zip(corners[1:], corners[2:], strict=False):
+            for second, third in itertools.pairwise(corners[1:]):
                 corner_indices += [corners[0], second, third]
                 face_materials.append(current)
         elif kind == "usemtl":
@@ -80,7 +82,8 @@ def read_obj(text: str, folder: str, read_file: ReadFile) -> Mesh:
     corners_all = np.array(points, np.float64)
 
     # Faces with corners that do not exist, or without area.
-    whole = ((index[..., 0] >= 0) & (index[..., 0] < len(points))).all(1)
+    exists = (index[..., 0] >= 0) & (index[..., 0] < len(points))
+    whole = np.asarray(exists.all(1))
     xyz = corners_all[np.where(whole[:, None], index[..., 0], 0)]
     crossed = np.cross(xyz[:, 1] - xyz[:, 0], xyz[:, 2] - xyz[:, 0])
     whole &= np.linalg.norm(crossed, axis=1) > 0
@@ -103,7 +106,7 @@ def read_obj(text: str, folder: str, read_file: ReadFile) -> Mesh:
 
 def _corner(word: str, counts: tuple[int, int, int]) -> tuple[int, int, int]:
     """Indices from 0 of "v/vt/vn"; −1 for a missing one. Negative numbers count from the end."""
-    parts = (word.split("/") + ["", ""])[:3]
+    parts = [*word.split("/"), "", ""][:3]
     found = []
     for part, count in zip(parts, counts, strict=True):
         number = int(part) if part else 0
@@ -165,7 +168,7 @@ def _material(facts: dict[str, list[str]], folder: str) -> Material:
     exponent = float(facts.get("ns", ["10"])[0])
 
     texture = None
-    if "map_kd" in facts and facts["map_kd"]:
+    if facts.get("map_kd"):
         # Options such as "-s 1 1 1" come before the name, which may have spaces in it.
         name = re.sub(r"^(-\w+( -?[\d.]+| on| off)+ )+", "", " ".join(facts["map_kd"]))
         texture = posixpath.normpath(posixpath.join(folder, name.replace("\\", "/")))

@@ -1,4 +1,4 @@
-"""A camera that turns light into a photo: exposure, tone, white balance, glare, blur, noise, JPEG."""
+"""A camera that turns light into a photo: exposure, tone, colour, glare, blur, noise, JPEG."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
 from worlds.pictures import linear_to_srgb
 
 Rng = np.random.Generator
@@ -46,7 +47,7 @@ def choose_development(rng: Rng, radiance: Floats) -> Development:
     return Development(
         exposure=exposure,
         white_balance=balance.astype(np.float32),
-        contrast=float(rng.uniform(0.2, 0.9)),
+        contrast=float(rng.uniform(0.1, 0.7)),
         saturation=float(rng.uniform(0.85, 1.2)),
         glare=float(rng.uniform(0.01, 0.06)),
         vignette=float(rng.uniform(0.0, 0.25)),
@@ -81,7 +82,7 @@ def photographed(rng: Rng, srgb: Floats, settings: Development) -> bytes:
     """The photo as a JPEG file, with blur and noise."""
     picture = srgb
     if settings.blur_px:
-        picture = cv2.GaussianBlur(picture, (0, 0), settings.blur_px)
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), settings.blur_px), np.float32)
     # Noise of light grows with its root; half of it is shared by neighbours, as demosaicing does.
     grain = rng.standard_normal(picture.shape).astype(np.float32)
     coarse = cv2.GaussianBlur(rng.standard_normal(picture.shape).astype(np.float32), (0, 0), 0.8)

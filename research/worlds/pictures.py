@@ -65,7 +65,7 @@ def pyramids(pictures: Sequence[Bytes]) -> Pyramids:
     mean = np.ones((max(1, len(pictures)), 3), np.float32)
     start = 0
     for number, picture in enumerate(pictures):
-        chain = _chain(picture)
+        chain = _kept_chain(picture)
         sizes[number] = chain[0].shape[1], chain[0].shape[0]
         levels[number] = len(chain)
         has_holes[number] = bool((chain[0][..., 3] < WHITE // 2).any())
@@ -76,6 +76,20 @@ def pyramids(pictures: Sequence[Bytes]) -> Pyramids:
             start += small.shape[0] * small.shape[1]
     texels = np.concatenate(parts) if parts else np.full((1, 4), WHITE, np.uint8)
     return Pyramids(texels, offsets, sizes, levels, has_holes, mean)
+
+
+_CHAINS: dict[int, tuple[Bytes, list[Bytes]]] = {}  # by the picture's identity, which it keeps
+
+
+def _kept_chain(picture: Bytes) -> list[Bytes]:
+    """See `_chain`; the levels of pictures that stay in memory are made once."""
+    found = _CHAINS.get(id(picture))
+    if found is None:
+        if len(_CHAINS) > KEPT_PICTURES:
+            _CHAINS.clear()
+        found = (picture, _chain(picture))
+        _CHAINS[id(picture)] = found
+    return found[1]
 
 
 def _chain(picture: Bytes) -> list[Bytes]:
@@ -105,7 +119,7 @@ def _halved(picture: Floats, axis: int) -> Floats:
         return picture
     first = np.take(picture, np.arange(0, count, 2), axis)
     second = np.take(picture, np.minimum(np.arange(1, count + 1, 2), count - 1), axis)
-    return ((first + second) / 2).astype(np.float32)
+    return np.asarray((first + second) / 2, np.float32)
 
 
 @functools.lru_cache(KEPT_PICTURES)

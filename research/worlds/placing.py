@@ -7,6 +7,7 @@ import math
 from typing import Literal
 
 import numpy as np
+
 from worlds.library import Model
 
 Rng = np.random.Generator
@@ -254,9 +255,7 @@ class Place:
             x, y = base.beside(sideways, forward)
             turn = self.rng.normal(0, 20) if facing else self.rng.uniform(0, 360)
             thing = Placed(model, x, y, level, base.angle + turn)
-            clash = any(
-                thing.box.meets(other.box) for other in self.things if other is not base
-            )
+            clash = any(thing.box.meets(other.box) for other in self.things if other is not base)
             if not clash:
                 found.append(self.put(thing))
         return found

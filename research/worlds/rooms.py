@@ -16,15 +16,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
 from worlds.furniture import Furniture
 from worlds.lights import Lights, made_sky
 from worlds.meshes import Material, Mesh, box, joined, quad, rotation_z
-from worlds.placing import WALLS, Opening, Place, Placed, WallName
+from worlds.placing import WALLS, Box, Opening, Place, Placed, WallName
 from worlds.shell import (
     WALL_M,
     WHITE,
@@ -66,7 +67,9 @@ class WorldPlan:
 class Builder:
     """Collects the meshes of a room while its rules run."""
 
-    def __init__(self, rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None) -> None:
+    def __init__(
+        self, rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None
+    ) -> None:
         """Start with an empty room of random kind and size."""
         self.rng = rng
         self.furniture = furniture
@@ -82,10 +85,6 @@ class Builder:
         depth = rng.uniform(2.4, 4.2) if small else rng.uniform(3.0, 7.0)
         height = rng.uniform(2.35, 3.1)
         self.place = Place(rng, width, depth, height, _openings(rng, width, depth, height, small))
-
-    def of(self, group: str) -> list[object]:
-        """The models of a group."""
-        return list(self.furniture.of(group))
 
     def surface(self, *kinds: str) -> Surface:
         """A random surface of one of these kinds."""
@@ -127,7 +126,9 @@ def _openings(rng: Rng, width: float, depth: float, height: float, small: bool) 
         kind = "passage"
     start = rng.uniform(0.15, max(0.16, length - wide - 0.15))
     top = min(2.08, height - 0.1)
-    openings.append(Opening(door_wall, start, wide, 0.0, top, "door" if kind == "door" else "passage"))
+    openings.append(
+        Opening(door_wall, start, wide, 0.0, top, "door" if kind == "door" else "passage")
+    )
     return openings
 
 
@@ -162,7 +163,9 @@ def _living(room: Builder) -> None:
         for side in (-1, 1):
             if rng.random() < 0.6:
                 where = sofa.beside(side * rng.uniform(1.2, 1.9), rng.uniform(1.0, 1.6))
-                place.on_floor(find("armchair"), where, 0.1, sofa.angle - side * rng.uniform(50, 100))
+                place.on_floor(
+                    find("armchair"), where, 0.1, sofa.angle - side * rng.uniform(50, 100)
+                )
             if rng.random() < 0.5:
                 beside = sofa.beside(side * (sofa.model.entry.size_m[0] / 2 + 0.35), 0.0)
                 small = place.on_floor(find("bedside"), beside, 0.0, sofa.angle, tries=3)
@@ -199,7 +202,9 @@ def _bedroom(room: Builder) -> None:
             if small is not None:
                 place.on_top(small, find("table_lamp"), 1)
                 place.on_top(small, find("bedroom_small"), 2)
-        place.on_top(bed, find("bedroom_small") + find("toy"), int(rng.integers(0, 3)), facing=False)
+        place.on_top(
+            bed, find("bedroom_small") + find("toy"), int(rng.integers(0, 3)), facing=False
+        )
         place.on_top(bed, find("pet") + find("floor_person"), int(rng.random() < 0.2), facing=False)
     place.at_wall(find("wardrobe"))
     chest = place.at_wall(find("sideboard"))
@@ -300,8 +305,8 @@ def _dining_group(room: Builder, middle: tuple[float, float] | None) -> None:
         if chair:
             thing = Placed(chair[0], x, y, 0.0, table.angle + turn + rng.normal(0, 8))
             others = [box_ for box_ in place.taken if box_ != table.box]
-            inside = 0 < thing.box.x0 and thing.box.x1 < place.width
-            inside = inside and 0 < thing.box.y0 and thing.box.y1 < place.depth
+            inside = thing.box.x0 > 0 and thing.box.x1 < place.width
+            inside = inside and thing.box.y0 > 0 and thing.box.y1 < place.depth
             if inside and not any(thing.box.meets(other) for other in others):
                 place.put(thing)
                 if rng.random() < 0.06:
@@ -473,7 +478,7 @@ def _bookcase(room: Builder) -> None:
     """A bookcase with books at a wall, with small things on its free places."""
     rng = room.rng
     place = room.place
-    wood = room.surface("wood", "wood", "plaster")
+    wood = room.surface("wood")
     shelf = made_shelf(rng, material_of(wood), wood.tile_m)
     library = room.furniture.of("bookcase")
     if not library:
@@ -523,28 +528,42 @@ def _build_shell(room: Builder) -> None:
     rng = room.rng
     place = room.place
     wet = room.kind in ("bathroom", "kitchen")
-    floor = room.surface("tiles", "marble", "tiles") if wet and rng.random() < 0.7 else room.surface(
-        "planks", "planks", "parquet", "tiles", "carpet", "concrete", "marble"
+    floor = (
+        room.surface("tiles", "marble", "tiles")
+        if wet and rng.random() < 0.7
+        else room.surface("planks", "planks", "parquet", "tiles", "carpet", "concrete", "marble")
     )
-    wall = room.surface("plaster", "plaster", "plaster", "wallpaper", "brick" if rng.random() < 0.3 else "plaster")
+    wall = room.surface("plaster", "plaster", "plaster", "plaster", "wallpaper")
     if room.kind == "bathroom":
         wall = room.surface("wall_tiles")
-    accent = room.surface("plaster", "wallpaper", "brick", "concrete") if rng.random() < 0.35 else wall
+    accent = (
+        room.surface("plaster", "wallpaper", "brick", "concrete") if rng.random() < 0.35 else wall
+    )
     width, depth, height = place.width, place.depth, place.height
 
     turned = rng.random() < 0.5
     sides = ((width, 0, 0), (0, depth, 0))
     if turned:
-        floor_mesh = quad((width, 0, 0), sides[1], (-width, 0, 0), material_of(floor), (floor.tile_m,) * 2)
+        floor_mesh = quad(
+            (width, 0, 0), sides[1], (-width, 0, 0), material_of(floor), (floor.tile_m,) * 2
+        )
     else:
         floor_mesh = quad((0, 0, 0), *sides, material_of(floor), (floor.tile_m,) * 2)
     room.parts.append(floor_mesh)
-    ceiling = Material((0.95, 0.95, 0.94)) if rng.random() < 0.85 else material_of(room.surface("wood", "plaster"))
+    ceiling = (
+        Material((0.95, 0.95, 0.94))
+        if rng.random() < 0.85
+        else material_of(room.surface("wood", "plaster"))
+    )
     room.parts.append(quad((0, depth, height), (width, 0, 0), (0, -depth, 0), ceiling, (1.5, 1.5)))
     _beams(room)
 
     shade = rng.choice([0.93, 0.9, 0.6, 0.3])
-    trim = Material((shade, shade * rng.uniform(0.85, 1), shade * rng.uniform(0.7, 1)), specular=0.04, roughness=0.4)
+    trim = Material(
+        (shade, shade * rng.uniform(0.85, 1), shade * rng.uniform(0.7, 1)),
+        specular=0.04,
+        roughness=0.4,
+    )
     accent_wall = WALLS[int(rng.integers(4))]
     skirting = rng.uniform(0.05, 0.14)
     rail = room.kind in ("dining", "living", "office") and rng.random() < 0.2
@@ -553,27 +572,23 @@ def _build_shell(room: Builder) -> None:
         length = place.length(name)
         mine = [one for one in place.openings if one.wall == name]
         skin = accent if name == accent_wall else wall
-        room.parts += wall_with_openings(frame, length, height, mine, material_of(skin), skin.tile_m)
+        room.parts += wall_with_openings(
+            frame, length, height, mine, material_of(skin), skin.tile_m
+        )
         if room.kind != "bathroom":
             room.parts += strip(frame, length, mine, 0, skirting, 0.015, trim)
         if rail:
             room.parts += strip(frame, length, mine, 0.9, 0.96, 0.02, trim)
         for opening in mine:
             if opening.kind == "window":
-                paint = trim if rng.random() < 0.3 else Material(WHITE, specular=0.04, roughness=0.4)
+                paint = (
+                    trim if rng.random() < 0.3 else Material(WHITE, specular=0.04, roughness=0.4)
+                )
                 room.parts += window_frame(rng, frame, opening, paint)
                 _curtains(room, frame, opening, length)
             else:
                 room.parts += door_way(frame, opening, trim)
                 _behind(room, frame, opening)
-    room.parts += _outer_shell(place)
-
-
-def _outer_shell(place: Place) -> list[Mesh]:
-    """The ground outside, which lights the room from below the window."""
-    ground = Material((0.5, 0.5, 0.45))
-    far = 30.0
-    return [quad((-far, -far, -0.6), (2 * far, 0, 0), (0, 2 * far, 0), ground)]
 
 
 def _beams(room: Builder) -> None:
@@ -604,25 +619,35 @@ def _curtains(room: Builder, frame: WallFrame, opening: Opening, length: float) 
     away = 0.14
     left = max(0.02, opening.start - 0.2)
     right = min(length - 0.02, opening.start + opening.width + 0.2)
-    room.parts.append(curtain(rng, frame, left, left + wide, low, high, away, material, cloth.tile_m))
-    room.parts.append(curtain(rng, frame, right - wide, right, low, high, away, material, cloth.tile_m))
+    room.parts.append(
+        curtain(rng, frame, left, left + wide, low, high, away, material, cloth.tile_m)
+    )
+    room.parts.append(
+        curtain(rng, frame, right - wide, right, low, high, away, material, cloth.tile_m)
+    )
     rod = Material((0.25, 0.22, 0.2), specular=0.2, roughness=0.3)
-    room.parts.append(frame.block(left - 0.03, right + 0.03, high - 0.01, high + 0.015, -away - 0.012, -away + 0.012, rod))
+    room.parts.append(
+        frame.block(
+            left - 0.03, right + 0.03, high - 0.01, high + 0.015, -away - 0.012, -away + 0.012, rod
+        )
+    )
 
 
 def _behind(room: Builder, frame: WallFrame, opening: Opening) -> None:
     """A closed door, or what one sees through a passage: a corridor or another room."""
     rng = room.rng
     if opening.kind == "door":
-        doors = room.furniture.of("door")
         left = opening.start
         right = opening.start + opening.width
-        paint = Material(WHITE if rng.random() < 0.5 else (0.5, 0.33, 0.2), specular=0.04, roughness=0.4)
-        if doors and rng.random() < 0.0:
-            return
+        paint = Material(
+            WHITE if rng.random() < 0.5 else (0.5, 0.33, 0.2), specular=0.04, roughness=0.4
+        )
         room.parts.append(frame.block(left, right, 0.005, opening.top, 0.04, 0.08, paint))
         for low, high in ((0.15, 0.8), (1.0, opening.top - 0.15)):  # panels
-            for start, end in ((left + 0.1, (left + right) / 2 - 0.04), ((left + right) / 2 + 0.04, right - 0.1)):
+            for start, end in (
+                (left + 0.1, (left + right) / 2 - 0.04),
+                ((left + right) / 2 + 0.04, right - 0.1),
+            ):
                 room.parts.append(frame.block(start, end, low, high, 0.03, 0.04, paint))
         knob = Material((0.7, 0.65, 0.5), specular=0.4, roughness=0.25)
         room.parts.append(frame.block(right - 0.12, right - 0.06, 1.0, 1.03, -0.03, 0.04, knob))
@@ -645,14 +670,32 @@ def _behind(room: Builder, frame: WallFrame, opening: Opening) -> None:
         frame.block(left, right, -0.01, 0.0, 0.0, outer, material_of(floor), floor.tile_m),
         frame.block(left, right, height, height + 0.01, inner, outer, Material((0.94, 0.94, 0.93))),
         frame.block(left, opening.start, 0, height, inner - 0.005, inner, skin, wall.tile_m),
-        frame.block(opening.start + opening.width, right, 0, height, inner - 0.005, inner, skin, wall.tile_m),
-        frame.block(opening.start, opening.start + opening.width, opening.top, height, inner - 0.005, inner, skin),
+        frame.block(
+            opening.start + opening.width, right, 0, height, inner - 0.005, inner, skin, wall.tile_m
+        ),
+        frame.block(
+            opening.start,
+            opening.start + opening.width,
+            opening.top,
+            height,
+            inner - 0.005,
+            inner,
+            skin,
+        ),
     ]
     room.parts += parts
     middle = frame.point((left + right) / 2, height - 0.35, inner + reach / 2)
     glow = np.array([1.0, 0.9, 0.75]) * rng.uniform(0.3, 2.0)
     room.lamps.append(((middle[0], middle[1], middle[2]), 0.12, glow))
-    groups = ("sideboard", "floor_plant", "chair", "bookcase", "floor_clutter", "wardrobe", "person")
+    groups = (
+        "sideboard",
+        "floor_plant",
+        "chair",
+        "bookcase",
+        "floor_clutter",
+        "wardrobe",
+        "person",
+    )
     for _ in range(3):
         models = room.furniture.of(groups[int(rng.integers(len(groups)))])
         if not models:
@@ -692,8 +735,6 @@ def _hang_pictures(room: Builder) -> None:
         other = np.array(frame.point(middle + wide / 2 + 0.05, height + high / 2 + 0.05, 0.0))
         low = np.minimum(one, other)
         top = np.maximum(one, other)
-        from worlds.placing import Box
-
         region = Box(low[0], low[1], top[0], top[1], low[2], top[2])
         if blocked or any(region.meets(taken) for taken in place.taken):
             continue
@@ -710,14 +751,8 @@ def _mesh_of(room: Builder, thing: Placed, shines: bool) -> Mesh:
     if shines:
         materials = [_shining(material) for material in materials]
     mesh = mesh.with_materials(materials)
-    plain = [m.texture is None for m in mesh.materials]
-    skinned = [new.texture is not None and old for new, old in zip(materials, plain, strict=True)]
-    del skinned
     turn = rotation_z(thing.angle) * thing.scale
     return _with_box_uv(mesh, thing, room).moved(turn, (thing.x, thing.y, thing.z))
-
-
-MADE_SKIN = "made-skin:"  # marks materials whose texture coordinates are made, too
 
 
 def _skinned(room: Builder, thing: Placed, material: Material) -> Material:
@@ -733,18 +768,22 @@ def _skinned(room: Builder, thing: Placed, material: Material) -> Material:
     if size < 0.4:
         hue = np.clip(rng.random(3) * rng.uniform(0.3, 1.0) + 0.1, 0.05, 0.92)
         red, green, blue = (float(value) for value in hue)
-        return dataclasses.replace(material, color=(red, green, blue), specular=0.05, roughness=0.25)
+        return dataclasses.replace(
+            material, color=(red, green, blue), specular=0.05, roughness=0.25
+        )
     soft = any(thing.model in room.furniture.of(group) for group in SOFT_GROUPS)
     if soft:
-        return material_of(room.surface("fabric", "fabric", "carpet"))
-    if room.kind == "bathroom" or rng.random() < 0.35:
+        return material_of(room.surface("fabric"))
+    if room.kind == "bathroom" or rng.random() < 0.4:
         return _toned(rng, material)
-    return material_of(room.surface("wood", "wood", "plaster"))
+    return material_of(room.surface("wood"))
 
 
 def _toned(rng: Rng, material: Material) -> Material:
     """The material in a little different colour."""
-    shift = np.clip(np.array(material.color) * rng.uniform(0.8, 1.1) + rng.normal(0, 0.02, 3), 0.02, 0.95)
+    shift = np.clip(
+        np.array(material.color) * rng.uniform(0.8, 1.1) + rng.normal(0, 0.02, 3), 0.02, 0.95
+    )
     red, green, blue = (float(value) for value in shift)
     return dataclasses.replace(material, color=(red, green, blue))
 
@@ -778,7 +817,10 @@ def _with_box_uv(mesh: Mesh, thing: Placed, room: Builder) -> Mesh:
     second = np.where(axis == 2, 1, 2)
     rows = np.arange(len(corners))
     planar = np.stack(
-        [corners[rows[:, None], np.arange(3)[None], first[:, None]], corners[rows[:, None], np.arange(3)[None], second[:, None]]],
+        [
+            corners[rows[:, None], np.arange(3)[None], first[:, None]],
+            corners[rows[:, None], np.arange(3)[None], second[:, None]],
+        ],
         -1,
     )
     uv = mesh.uv.copy()
@@ -818,7 +860,9 @@ def _light(room: Builder) -> Lights:
     for opening in windows:
         frame = WallFrame(place, opening.wall)
         corner = frame.point(opening.start, opening.bottom, 0.05)
-        portals.append([corner, (opening.width * frame.along), ((opening.top - opening.bottom) * frame.up)])
+        portals.append(
+            [corner, (opening.width * frame.along), ((opening.top - opening.bottom) * frame.up)]
+        )
 
     _switch_on(room, evening)
     count = len(room.lamps)
@@ -826,8 +870,10 @@ def _light(room: Builder) -> Lights:
         sky=(sky * brightness).astype(np.float32),
         sun_direction=sun,
         sun_color=(warm * strength).astype(np.float32),
-        sun_spread=0.006 if rng.random() < 0.7 else 0.03,
-        portals=np.array([[np.asarray(p, np.float64) for p in one] for one in portals], np.float64).reshape(-1, 3, 3).astype(np.float32),
+        sun_spread=float(rng.uniform(0.004, 0.012)),
+        portals=np.array([[np.asarray(p, np.float64) for p in one] for one in portals], np.float64)
+        .reshape(-1, 3, 3)
+        .astype(np.float32),
         lamp_positions=np.array([lamp[0] for lamp in room.lamps], np.float32).reshape(count, 3),
         lamp_radii=np.array([lamp[1] for lamp in room.lamps], np.float32),
         lamp_colors=np.array([lamp[2] for lamp in room.lamps], np.float32).reshape(count, 3),
@@ -855,6 +901,8 @@ def _switch_on(room: Builder, evening: bool) -> None:
         radius = rng.uniform(0.1, 0.2)
         z = place.height
         glow = Material((0.95, 0.93, 0.88), emission=3.0)
-        room.parts.append(box((x - radius, y - radius, z - 0.06), (x + radius, y + radius, z - 0.001), glow))
+        room.parts.append(
+            box((x - radius, y - radius, z - 0.06), (x + radius, y + radius, z - 0.001), glow)
+        )
         warm = np.array([1.0, rng.uniform(0.75, 0.97), rng.uniform(0.5, 0.95)])
         room.lamps.append(((x, y, z - 0.18), 0.1, warm * rng.uniform(1.5, 4.0)))

@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+
 from worlds.meshes import Material, Mesh, box, joined, quad, smooth_normals
 from worlds.placing import Opening, Place, WallName
 from worlds.surfaces import Surface
@@ -84,9 +86,7 @@ class WallFrame:
         one = np.array(self.point(left, bottom, inner))
         other = np.array(self.point(right, top, outer))
         tile = None if tile_m is None else (tile_m, tile_m)
-        return box(
-            np.minimum(one, other).tolist(), np.maximum(one, other).tolist(), material, tile
-        )
+        return box(np.minimum(one, other).tolist(), np.maximum(one, other).tolist(), material, tile)
 
 
 def wall_with_openings(
@@ -150,9 +150,7 @@ def window_frame(rng: Rng, frame: WallFrame, opening: Opening, material: Materia
         thin = bar / 3
         parts.append(frame.block(left, right, middle - thin, middle + thin, inner, outer, material))
     if low > 0.2:
-        parts.append(
-            frame.block(left - 0.06, right + 0.06, low - 0.04, low, -0.12, 0.1, material)
-        )
+        parts.append(frame.block(left - 0.06, right + 0.06, low - 0.04, low, -0.12, 0.1, material))
     return parts
 
 
@@ -191,7 +189,15 @@ def strip(
 
 
 def curtain(
-    rng: Rng, frame: WallFrame, left: float, right: float, low: float, high: float, away: float, material: Material, tile_m: float
+    rng: Rng,
+    frame: WallFrame,
+    left: float,
+    right: float,
+    low: float,
+    high: float,
+    away: float,
+    material: Material,
+    tile_m: float,
 ) -> Mesh:
     """A hanging cloth in folds, between two places along a wall."""
     width = right - left
@@ -218,10 +224,10 @@ def curtain(
     return _sheet(grid, uv, material)
 
 
-def _sheet(grid: np.ndarray, uv: np.ndarray, material: Material) -> Mesh:  # type: ignore[type-arg]
+def _sheet(grid: NDArray[np.float64], uv: NDArray[np.float64], material: Material) -> Mesh:
     """A mesh of a grid of points [R, C, 3] with texture coordinates [R, C, 2]."""
 
-    def triangles(values: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    def triangles(values: NDArray[np.float64]) -> NDArray[np.float64]:
         """[F, 3, K] the values at the corners of all triangles."""
         a = values[:-1, :-1].reshape(-1, values.shape[-1])
         b = values[:-1, 1:].reshape(-1, values.shape[-1])
@@ -241,7 +247,12 @@ def _sheet(grid: np.ndarray, uv: np.ndarray, material: Material) -> Mesh:  # typ
 
 
 def picture_frame(
-    rng: Rng, frame: WallFrame, middle: float, height: float, size: tuple[float, float], photo: Material
+    rng: Rng,
+    frame: WallFrame,
+    middle: float,
+    height: float,
+    size: tuple[float, float],
+    photo: Material,
 ) -> list[Mesh]:
     """A framed photo on a wall, sometimes with a mount; its middle is at `height`."""
     wide, high = size
@@ -323,7 +334,7 @@ def _books(
     rng: Rng, left: float, right: float, low: float, room: float, depth: float
 ) -> list[Mesh]:
     """Books that stand side by side from `left` to `right` on a board."""
-    parts = []
+    parts: list[Mesh] = []
     x = left
     usual = rng.uniform(0.6, 0.95) * room
     while True:
@@ -332,7 +343,8 @@ def _books(
             return parts
         high = min(usual * rng.uniform(0.8, 1.1), room)
         deep = min(depth - 0.02, high * rng.uniform(0.6, 0.8))
-        hue = rng.random(3) * rng.uniform(0.2, 0.9) + rng.uniform(0, 0.15)
+        grey = rng.uniform(0.1, 0.8)
+        hue = grey + (rng.random(3) - 0.5) * rng.uniform(0.05, 0.6) * min(1.0, 1.6 * grey)
         red, green, blue = np.clip(hue, 0.03, 0.95)
         cover = Material((float(red), float(green), float(blue)), specular=0.03, roughness=0.5)
         front = -depth + 0.01 + rng.uniform(0, 0.03)

@@ -14,19 +14,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from worlds.lights import cloud_noise
 
 from spackle.runtime.files import atomic_path
+from worlds.lights import cloud_noise
 
 Rng = np.random.Generator
 Image3 = NDArray[np.float64]  # [S, S, 3] sRGB in 0..1
 SIDE = 512  # pixels
 PER_KIND = 16
-SURFACES_VERSION = 1  # increases whenever the pictures change
+SURFACES_VERSION = 2  # increases whenever the pictures change
 
 WOODS = ((0.62, 0.45, 0.28), (0.72, 0.56, 0.38), (0.45, 0.3, 0.18), (0.3, 0.19, 0.12),
          (0.8, 0.68, 0.5), (0.55, 0.52, 0.48), (0.5, 0.27, 0.16))  # fmt: skip
-STONES = ((0.75, 0.72, 0.68), (0.5, 0.5, 0.5), (0.3, 0.3, 0.32), (0.85, 0.82, 0.78), (0.6, 0.5, 0.42))
+STONES = (
+    (0.75, 0.72, 0.68),
+    (0.5, 0.5, 0.5),
+    (0.3, 0.3, 0.32),
+    (0.85, 0.82, 0.78),
+    (0.6, 0.5, 0.42),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +63,9 @@ def _surfaces(folder: Path, kind: str) -> list[Surface]:
         picture, tile_m, specular, roughness = draw(rng, not path.is_file())
         if picture is not None:
             with atomic_path(path) as temporary:
-                Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)).save(temporary)
+                Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)).save(
+                    temporary
+                )
         found.append(Surface(kind, str(path), tile_m, specular, roughness))
     return found
 
@@ -117,7 +125,9 @@ def planks(rng: Rng, wanted: bool) -> Drawn:
     picture = _colored(shade * (1 + rng.uniform(0.03, 0.1) * grain), color)
     within = y * boards % 1
     along = (x + shift) * pieces % 1
-    gap = (np.minimum(within, 1 - within) < 0.012) | (np.minimum(along, 1 - along) < 0.0015 * pieces)
+    gap = (np.minimum(within, 1 - within) < 0.012) | (
+        np.minimum(along, 1 - along) < 0.0015 * pieces
+    )
     return np.where(gap[..., None], picture * 0.45, picture), boards * width_m, specular, roughness
 
 
@@ -189,7 +199,9 @@ def wall_tiles(rng: Rng, wanted: bool) -> Drawn:
     across = (x + shift) * count % 1
     column = ((x + shift) * count % count).astype(int)
     shade = 1 + rng.normal(0, rng.uniform(0.0, 0.05), (rows, count))[row, column]
-    edge = np.minimum(np.minimum(across, 1 - across), np.minimum(y * rows % 1, 1 - y * rows % 1) / ratio)
+    edge = np.minimum(
+        np.minimum(across, 1 - across), np.minimum(y * rows % 1, 1 - y * rows % 1) / ratio
+    )
     noise = cloud_noise(rng, (SIDE, SIDE), 16, 4)
     picture = _colored(shade * (1 + 0.01 * noise), color)
     mortar = np.full(3, rng.uniform(0.5, 0.85))
@@ -209,11 +221,11 @@ def plaster(rng: Rng, wanted: bool) -> Drawn:
     specular, roughness = 0.0, 1.0
     if not wanted:
         return None, tile_m, specular, roughness
-    saturation = rng.choice([0.03, 0.12, 0.3, 0.5], p=[0.4, 0.3, 0.2, 0.1])
-    color = _hue(rng, saturation, rng.uniform(0.72, 0.95) - 0.35 * saturation)
+    saturation = rng.choice([0.03, 0.08, 0.16, 0.35], p=[0.4, 0.3, 0.2, 0.1])
+    color = _hue(rng, saturation, rng.uniform(0.78, 0.95) - 0.3 * saturation)
     broad = cloud_noise(rng, (SIDE, SIDE), 3, 6)
     fine = cloud_noise(rng, (SIDE, SIDE), 96, 3)
-    value = 1 + rng.uniform(0.002, 0.02) * broad + rng.uniform(0.003, 0.02) * fine
+    value = 1 + rng.uniform(0.001, 0.008) * broad + rng.uniform(0.002, 0.012) * fine
     return _colored(value, color), tile_m, specular, roughness
 
 
@@ -223,9 +235,9 @@ def wallpaper(rng: Rng, wanted: bool) -> Drawn:
     tile_m = repeats * rng.uniform(0.15, 0.5)
     if not wanted:
         return None, tile_m, 0.0, 1.0
-    ground = _hue(rng, rng.uniform(0, 0.3), rng.uniform(0.55, 0.92))
-    ink = np.clip(ground + rng.choice([-1, 1]) * rng.uniform(0.06, 0.3), 0.05, 0.97) * _hue(
-        rng, rng.uniform(0, 0.4), 1.0
+    ground = _hue(rng, rng.uniform(0, 0.2), rng.uniform(0.65, 0.93))
+    ink = np.clip(ground + rng.choice([-1, 1]) * rng.uniform(0.04, 0.2), 0.05, 0.97) * _hue(
+        rng, rng.uniform(0, 0.25), 1.0
     )
     x, y = _grid()
     a = x * repeats % 1 - 0.5
@@ -240,7 +252,9 @@ def wallpaper(rng: Rng, wanted: bool) -> Drawn:
         b = (y * repeats + odd) % 1 - 0.5 if repeats % 2 == 0 else b
         radius = np.hypot(a, b)
         angle = np.arctan2(b, a)
-        outline = rng.uniform(0.22, 0.4) * (1 + rng.uniform(0.2, 0.6) * np.cos(petals * angle)) / 1.5
+        outline = (
+            rng.uniform(0.22, 0.4) * (1 + rng.uniform(0.2, 0.6) * np.cos(petals * angle)) / 1.5
+        )
         weight = (radius < outline) * 1.0 - 0.6 * (radius < outline * 0.35)
     else:  # a lattice of waves
         weight = (np.abs(np.sin(2 * np.pi * a) + np.cos(2 * np.pi * b)) < 0.3).astype(float)
@@ -316,7 +330,12 @@ def wood(rng: Rng, wanted: bool) -> Drawn:
     if not wanted:
         return None, tile_m, specular, roughness
     grain = _grain(rng, 32).T
-    return _colored(1 + rng.uniform(0.04, 0.12) * grain, _pick(rng, WOODS)), tile_m, specular, roughness
+    return (
+        _colored(1 + rng.uniform(0.04, 0.12) * grain, _pick(rng, WOODS)),
+        tile_m,
+        specular,
+        roughness,
+    )
 
 
 def brick(rng: Rng, wanted: bool) -> Drawn:
@@ -363,8 +382,13 @@ def concrete(rng: Rng, wanted: bool) -> Drawn:
     if not wanted:
         return None, tile_m, 0.02, 0.6
     noise = cloud_noise(rng, (SIDE, SIDE), 4, 8)
-    value = 1 + rng.uniform(0.04, 0.1) * noise
-    return _colored(value, np.full(3, rng.uniform(0.35, 0.7)) + rng.normal(0, 0.015, 3)), tile_m, 0.02, 0.6
+    value = 1 + rng.uniform(0.02, 0.06) * noise
+    return (
+        _colored(value, np.full(3, rng.uniform(0.35, 0.7)) + rng.normal(0, 0.015, 3)),
+        tile_m,
+        0.02,
+        0.6,
+    )
 
 
 KINDS: dict[str, Callable[[Rng, bool], Drawn]] = {

@@ -6,14 +6,13 @@ import dataclasses
 import math
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from worlds.caster import World
-from worlds.placing import Place
 
 from spackle.core.camera import Camera
 from spackle.core.focal_length import focal_mm_to_px
 from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory_cameras
+from worlds.caster import World
+from worlds.placing import Place
 
 Rng = np.random.Generator
 Floats = NDArray[np.float32]
@@ -82,7 +81,12 @@ def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpo
     # 24 to 70 mm; phones have 24 to 28 mm.
     focal_mm = 24 * (70 / 24) ** (rng.random() ** 1.6)
     camera = Camera.from_focal(focal_mm_to_px(focal_mm, width, height), width, height)
-    eye_height = float(rng.choice([rng.uniform(1.3, 1.7), rng.uniform(0.8, 1.3), rng.uniform(0.35, 0.8)], p=[0.6, 0.3, 0.1]))
+    eye_height = float(
+        rng.choice(
+            [rng.uniform(1.3, 1.7), rng.uniform(0.8, 1.3), rng.uniform(0.35, 0.8)],
+            p=[0.6, 0.3, 0.1],
+        )
+    )
     edge = 0.25
     x = rng.uniform(edge, place.width - edge)
     y = rng.uniform(edge, place.depth - edge)
@@ -153,8 +157,8 @@ def second_cameras(
     """
     near, focus = np.quantile(depth, [0.001, 0.1])
     depth_range = DepthRange(near=float(near), focus=max(2.0, float(focus)))
-    cameras = []
-    names = []
+    cameras: list[Camera] = []
+    names: list[str] = []
     while len(cameras) < SECOND_VIEWS:
         kind = SHARP_TRAJECTORIES[int(rng.integers(len(SHARP_TRAJECTORIES)))]
         disparity = float(rng.uniform(*DISPARITIES))
@@ -188,8 +192,3 @@ def _is_free(world: World, viewpoint: Viewpoint, camera: Camera) -> bool:
     origins, directions = viewpoint.rays(small, pixel_grid(9, 12))
     hits = world.first_hits(origins, directions)
     return bool(np.quantile(hits.distance, 0.02) > 0.5 * MIN_NEAR_M)
-
-
-def camera_tensor(values: Floats) -> torch.Tensor:
-    """A float tensor of an array."""
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))

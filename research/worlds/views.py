@@ -10,12 +10,12 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
-from worlds.caster import NUDGE_M, Hits, World
-from worlds.irradiance import Irradiance, solve, sun_on, tangents
-from worlds.lights import Lights
-from worlds.viewpoints import Viewpoint, pixel_grid
 
 from spackle.core.camera import Camera
+from worlds.caster import NUDGE_M, Hits, World
+from worlds.irradiance import Irradiance, solve, sun_on
+from worlds.lights import Lights
+from worlds.viewpoints import Viewpoint, pixel_grid
 
 Rng = np.random.Generator
 Floats = NDArray[np.float32]
@@ -24,7 +24,7 @@ EDGE_RAYS = 4  # further rays of a pixel at an edge
 EDGE_COSINE = 0.93  # neighbours of one surface have normals at less than 22 degrees
 EDGE_RATIO = 0.02  # neighbours of one surface are this near to each other's plane, in depths
 COARSE_M = 0.22  # width of coarse cells of light in rooms
-SHINY = 0.45  # surfaces rougher than this show no reflections
+SHINY = 0.35  # surfaces rougher than this show no reflections
 GLASS_SHINE = 0.1  # share of light that panes reflect; it comes from the room's mean
 MAX_RADIANCE = 12.0  # brighter rays would make edges hard again
 VALID, FAR, UNSURE = 1, 2, 0  # values of the validity mask
@@ -107,7 +107,8 @@ def _finished(
     """A view with smooth edges."""
     camera = middle.camera
     shape = (camera.height, camera.width)
-    colors, sunlit = _shaded(rng, world, lights, irradiance, camera, middle)
+    suns = _points_of_sun(lights)
+    colors, sunlit = _shaded(world, lights, irradiance, camera, middle, suns[0])
     edges = _edges(middle, sunlit, shape).reshape(-1)
     chosen = np.flatnonzero(edges)
     if len(chosen):
@@ -119,7 +120,7 @@ def _finished(
             pixels = centers + quarter + rng.random((len(chosen), 2)) / 2
             rays = viewpoint.rays(camera, pixels.astype(np.float32))
             more = _traced(world, camera, *rays)
-            extra, _ = _shaded(rng, world, lights, irradiance, camera, more)
+            extra, _ = _shaded(world, lights, irradiance, camera, more, suns[1 + number])
             total += np.minimum(extra, MAX_RADIANCE)
         colors[chosen] = total / (EDGE_RAYS + 1)
 
@@ -136,6 +137,19 @@ def _finished(
         normal.reshape(*shape, 3),
         valid.reshape(shape),
     )
+
+
+def _points_of_sun(lights: Lights) -> Floats:
+    """[1 + EDGE_RAYS, 3] unit directions to the middle of the sun and around it."""
+    across = np.cross(lights.sun_direction, [0.0, 0.0, 1.0])
+    across = across / max(float(np.linalg.norm(across)), 1e-6)
+    upwards = np.cross(across, lights.sun_direction)
+    angles = 2 * np.pi * (np.arange(EDGE_RAYS) + 0.4) / EDGE_RAYS
+    around = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * upwards
+    points = lights.sun_direction + 0.7 * lights.sun_spread * np.concatenate(
+        [0 * around[:1], around]
+    )
+    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True), np.float32)
 
 
 def _edges(middle: _Traced, sunlit: Floats, shape: tuple[int, int]) -> Bools:
@@ -164,14 +178,21 @@ def _edges(middle: _Traced, sunlit: Floats, shape: tuple[int, int]) -> Bools:
 
 
 def _shaded(
-    rng: Rng,
     world: World,
     lights: Lights,
     irradiance: Irradiance,
     camera: Camera,
     traced: _Traced,
+    sun_direction: Floats,
 ) -> tuple[Floats, Floats]:
-    """Linear colour [N, 3] of rays, and [N] the cosine towards the sun where it shines."""
+    """Linear colour [N, 3] of rays, and [N] the cosine towards the sun where it shines.
+
+    Args:
+        world, lights, irradiance: the world and its light.
+        camera: the rays' camera.
+        traced: the rays.
+        sun_direction: [3] to one point of the sun's disc; all rays of a pixel take different ones.
+    """
     hits = traced.hits
     count = len(hits.triangle)
     colors = np.zeros((count, 3), np.float32)
@@ -183,7 +204,11 @@ def _shaded(
     colors[open_sky] = lights.sky_smooth(unit[open_sky])
     if len(found):
         part = Hits(
-            hits.triangle[found], hits.distance[found], hits.u[found], hits.v[found], hits.passed[found]
+            hits.triangle[found],
+            hits.distance[found],
+            hits.u[found],
+            hits.v[found],
+            hits.passed[found],
         )
         normals = traced.smooth[found]
         positions = traced.positions[found]
@@ -196,14 +221,14 @@ def _shaded(
         if lights.sun_color.any():
             flat = traced.flat[found]
             # The flat normal decides whether light may come, the smooth one how much.
-            seen = sun_on(world, lights, rng, positions + NUDGE_M * flat, normals)
+            seen = sun_on(world, sun_direction, positions + NUDGE_M * flat, normals)
             sunlit[found] = seen
             light = light + seen[:, None] * lights.sun_color
         material = world.mesh.material[part.triangle]
         glow = world.emission[material][:, None] * world.color[material]
         shaded = albedo * light / np.pi + glow
         shaded = _with_reflections(
-            rng, world, lights, irradiance, shaded, part, positions, normals, towards, material
+            world, lights, irradiance, shaded, positions, normals, towards, material
         )
         colors[found] = shaded
     # Panes darken what is behind them, and mirror some of the room.
@@ -213,12 +238,10 @@ def _shaded(
 
 
 def _with_reflections(
-    rng: Rng,
     world: World,
     lights: Lights,
     irradiance: Irradiance,
     colors: Floats,
-    hits: Hits,
     positions: Floats,
     normals: Floats,
     towards: Floats,
@@ -228,23 +251,19 @@ def _with_reflections(
     specular = world.specular[material]
     roughness = world.roughness[material]
     shiny = np.flatnonzero((specular > 0.01) & (roughness < SHINY))
-    del hits
     if not len(shiny):
         return colors
     n = normals[shiny]
     v = towards[shiny]
-    rough = roughness[shiny] ** 2
-    # The mirrored ray, spread a little by the roughness.
-    spread = rng.standard_normal((len(shiny), 2)) * rough[:, None] * 0.5
-    first, second = tangents(n)
-    tilted = n + spread[:, :1] * first + spread[:, 1:] * second
-    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
-    cosine = (tilted * v).sum(1, keepdims=True)
-    direction = (2 * cosine * tilted - v).astype(np.float32)
+    blur = roughness[shiny]
+    # One mirrored ray; what it meets is blurred by the roughness. Spread rays would need to be
+    # many, or leave grain.
+    cosine = (n * v).sum(1, keepdims=True)
+    direction = (2 * cosine * n - v).astype(np.float32)
     above = (direction * n).sum(1) > 0.01
-    share = specular[shiny] + (1 - specular[shiny]) * np.clip(1 - cosine[:, 0], 0, 1) ** 5 * (
-        1 - roughness[shiny]
-    )
+    share = specular[shiny] + (1 - specular[shiny]) * np.clip(1 - cosine[:, 0], 0, 1) ** 5
+    # Rough surfaces scatter most of it, and fade out at the limit.
+    share = share * (1 - blur / SHINY)
     origins = positions[shiny] + _off_surface(n)
     mirrored = world.first_hits(origins.astype(np.float32), direction)
     seen = np.flatnonzero((mirrored.triangle >= 0) & above)
@@ -259,7 +278,8 @@ def _with_reflections(
         )
         where = (origins[seen] + part.distance[:, None] * direction[seen]).astype(np.float32)
         side, _ = world.normals(part, direction[seen])
-        own = world.albedo(part, (0.01 + 0.05 * part.distance).astype(np.float32))
+        width = 0.005 + (0.002 + 0.6 * blur[seen]) * part.distance
+        own = world.albedo(part, width.astype(np.float32))
         number = world.mesh.material[part.triangle]
         glow = world.emission[number][:, None] * world.color[number]
         light[seen] = own * irradiance.roughly_at(where, side) / np.pi + glow

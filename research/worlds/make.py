@@ -1,0 +1,190 @@
+"""Make worlds: furnished rooms as photos with depth, and six more views of each.
+
+    PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 1000 --photos PHOTOS
+
+A world depends on the seed and its number alone. The command goes on where it was stopped; archives
+that are there are kept. Two processes share the work by `--part 1/2` and `--part 2/2`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import list_files
+from spackle.runtime.folders import file_lock, make_folder
+from worlds.caster import World
+from worlds.fetch import cache_folder, open_library
+from worlds.furniture import Furniture
+from worlds.photo_camera import choose_development, photographed
+from worlds.photo_camera import developed as develop
+from worlds.rooms import DrawPhoto, furnish
+from worlds.shards import WORLDS_PER_SHARD, pack_world, shard_file, write_shard
+from worlds.viewpoints import choose_viewpoint, pixel_grid, second_cameras
+from worlds.views import VALID, render
+
+Rng = np.random.Generator
+SIZE = (336, 448)  # height and width of pictures
+UPRIGHT = 0.25  # share of worlds whose photo is upright
+ATTEMPTS = 20  # rooms that may show too little, one after another
+MIN_KNOWN = 0.6  # share of a photo with a known surface
+VERSION = 1  # increases whenever the same seed gives other worlds
+
+
+def photos_of(folder: Path | None) -> DrawPhoto | None:
+    """A source of photos for picture frames and for what is behind windows; None without a folder.
+
+    Raises:
+        InputError: the folder has no photos.
+    """
+    if folder is None:
+        return None
+    files = list_files(folder, tuple(PHOTO_SUFFIXES), below=True) if folder.is_dir() else []
+    if not files:
+        raise InputError(f"{folder}: contains no photos: give another folder as --photos")
+
+    def draw(rng: Rng) -> NDArray[np.uint8]:
+        """A random photo [H, W, 3]."""
+        with Image.open(files[int(rng.integers(len(files)))]) as photo:
+            return np.asarray(photo.convert("RGB"))
+
+    return draw
+
+
+def make_world(
+    furniture: Furniture,
+    cache: Path,
+    photo: DrawPhoto | None,
+    seed: int,
+    number: int,
+    size: tuple[int, int] = SIZE,
+) -> tuple[bytes, int]:
+    """A packed world, and its number of views.
+
+    Args:
+        furniture: models by group.
+        cache: the folder of surfaces.
+        photo: gives photos, or None.
+        seed, number: determine the world.
+        size: height and width, swapped in upright photos.
+
+    Raises:
+        InputError: no room in a row of `ATTEMPTS` shows enough.
+    """
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([VERSION, seed, number, attempt])
+        height, width = size if rng.random() >= UPRIGHT else size[::-1]
+        plan = furnish(rng, furniture, cache, photo)
+        world = World(plan.mesh, plan.pictures)
+        viewpoint = choose_viewpoint(rng, plan.place, world, height, width)
+        if viewpoint is None:
+            continue
+        hits = world.first_hits(*viewpoint.rays(viewpoint.camera, pixel_grid(height, width)))
+        known = hits.triangle >= 0
+        if known.mean() < MIN_KNOWN:
+            continue
+        cameras, names = second_cameras(rng, world, viewpoint, hits.distance[known])
+        views = render(rng, world, plan.lights, viewpoint, [viewpoint.camera, *cameras])
+        if (views[0].valid == VALID).mean() < MIN_KNOWN:
+            continue
+        settings = choose_development(rng, views[0].radiance)
+        jpeg = photographed(rng, develop(views[0].radiance, settings), settings)
+        facts = {
+            "version": VERSION,
+            "seed": seed,
+            "number": number,
+            "kind": plan.kind,
+            "models": list(plan.models),
+            "triangles": plan.mesh.count,
+            "trajectories": names,
+        }
+        key = f"{seed:02d}-{number:06d}"
+        return pack_world(key, jpeg, views, settings, facts), len(views)
+    raise InputError(f"world {number}: {ATTEMPTS} rooms in a row show too little")
+
+
+def make_shards(
+    output: Path,
+    make: Callable[[int], tuple[bytes, int]],
+    worlds: int,
+    part: tuple[int, int],
+    log: Callable[[str], None],
+) -> None:
+    """Write all archives that are missing.
+
+    Args:
+        output: their folder.
+        make: gives the packed world of a number, and its number of views.
+        worlds: how many there shall be.
+        part: this process's part, from 0, and the number of parts.
+        log: called with a line for each archive.
+    """
+    make_folder(output)
+    shards = -(-worlds // WORLDS_PER_SHARD)
+    for shard in range(part[0], shards, part[1]):
+        path = shard_file(output, shard)
+        if path.is_file():
+            continue
+        begin = time.perf_counter()
+        work_begin = time.process_time()
+        first = shard * WORLDS_PER_SHARD
+        numbers = range(first, min(first + WORLDS_PER_SHARD, worlds))
+        made = [make(number) for number in numbers]
+        write_shard(path, [data for data, _ in made])
+        views = sum(count for _, count in made)
+        seconds = time.perf_counter() - begin
+        work = time.process_time() - work_begin
+        log(
+            f"{path.name}: {len(made)} worlds, {views} views, {path.stat().st_size / 1e6:.1f} MB, "
+            f"{views / work:.2f} views a second of processor time, {views / seconds:.2f} of clock"
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help="a folder for archives")
+    parser.add_argument("--worlds", type=int, default=48, help="how many there shall be")
+    parser.add_argument("--photos", type=Path, help="photos for frames and windows")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cache", type=Path, help="where models are kept")
+    parser.add_argument("--part", default="1/1", help="1/2: the first of two processes")
+    options = parser.parse_args(arguments)
+    try:
+        which, parts = (int(word) for word in options.part.split("/"))
+        photo = photos_of(options.photos)
+        cache = cache_folder(options.cache)
+        furniture = Furniture(open_library(options.cache))
+
+        def make(number: int) -> tuple[bytes, int]:
+            """The world with this number."""
+            return make_world(furniture, cache, photo, options.seed, number)
+
+        make_folder(options.output)
+        with file_lock(options.output / f".part-{which}.lock"):
+            make_shards(
+                options.output,
+                make,
+                options.worlds,
+                (which - 1, parts),
+                lambda line: print(line, flush=True),
+            )
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,198 @@
+"""Whole worlds, from a catalogue of boxes."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_models import write_catalogue
+
+pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
+
+from worlds import surfaces, views
+from worlds.furniture import Furniture
+from worlds.library import Library
+from worlds.make import make_shards, make_world
+from worlds.placing import Box, Opening, Place
+from worlds.shards import read_view, shard_file, world_facts, world_keys, write_shard
+
+pytestmark = pytest.mark.slow
+SIZE = (48, 64)
+
+
+@pytest.fixture(scope="module")
+def furniture(tmp_path_factory: pytest.TempPathFactory) -> Furniture:
+    """Boxes as furniture."""
+    folder = tmp_path_factory.mktemp("library")
+    write_catalogue(folder / "Boxes.sh3f")
+    return Furniture(Library.open(folder / "models", [folder / "Boxes.sh3f"], print))
+
+
+@pytest.fixture(autouse=True)
+def small_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Textures that are quickly drawn."""
+    monkeypatch.setattr(surfaces, "SIDE", 64)
+    monkeypatch.setattr(surfaces, "PER_KIND", 2)
+    surfaces._surfaces.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for the surfaces of all tests."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@functools.cache
+def packed(furniture: Furniture, cache: Path, number: int) -> bytes:
+    """A packed world of boxes."""
+    return make_world(furniture, cache, None, 3, number, SIZE)[0]
+
+
+def test_the_same_number_gives_the_same_bytes_and_another_one_others(
+    furniture: Furniture, cache: Path
+) -> None:
+    again, count = make_world(furniture, cache, None, 3, 0, SIZE)
+    assert count == 7
+    assert again == packed(furniture, cache, 0)
+    assert again != packed(furniture, cache, 1)
+
+
+def test_depth_of_second_views_agrees_with_the_photos_depth(
+    furniture: Furniture, cache: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "worlds.tar"
+    write_shard(path, [packed(furniture, cache, number) for number in range(3)])
+    shares = []
+    color_errors = []
+    for key in world_keys(path):
+        photo = read_view(path, key, 0)
+        for number in range(1, 7):
+            other = read_view(path, key, number)
+            known = torch.from_numpy((photo.valid == 1) & (photo.depth > 0))
+            centers = photo.camera.pixel_centers()[known]
+            points = photo.camera.unproject(centers, torch.from_numpy(photo.depth)[known])
+            pixels, z = other.camera.project(points)
+            height, width = other.depth.shape
+            inside = (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+            column, row = pixels[inside].long().T
+            there = torch.from_numpy(other.depth)[row, column]
+            # What the photo sees is seen there too, or hidden by something nearer.
+            same = (there / z[inside] - 1).abs() < 0.03
+            hidden = (there > 0) & (there < z[inside])
+            shares.append(float((same | hidden).float().mean()))
+            color = torch.from_numpy(photo.rgb)[known][inside][same].float()
+            beside = torch.from_numpy(other.rgb)[row, column][same].float()
+            color_errors.append(float((color - beside).abs().median()))
+    assert np.mean(shares) > 0.95
+    assert np.mean(color_errors) < 6  # of 255: light does not change with the view
+
+
+def test_facts_name_models_trajectories_and_known_share(
+    furniture: Furniture, cache: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "worlds.tar"
+    write_shard(path, [packed(furniture, cache, 0)])
+    (key,) = world_keys(path)
+    facts = world_facts(path, key)
+    assert len(facts["trajectories"]) == 6
+    assert all(name.startswith(("Boxes#", "made#")) for name in facts["models"])
+    assert all(0 <= view["known"] <= 1 for view in facts["views"])
+
+
+def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
+    made: list[int] = []
+
+    def make(number: int) -> tuple[bytes, int]:
+        """Bytes that tell the number; the tenth world fails in the first run."""
+        if number == 9 and len(made) == 9:
+            raise KeyboardInterrupt
+        made.append(number)
+        return bytes([number]) * 512, 7
+
+    with pytest.raises(KeyboardInterrupt):
+        make_shards(tmp_path, make, 12, (0, 1), print)
+    assert [file.name for file in tmp_path.iterdir()] == [shard_file(tmp_path, 0).name]
+    make_shards(tmp_path, make, 12, (0, 1), print)
+    assert made == [*range(9), *range(8, 12)]
+    assert shard_file(tmp_path, 1).read_bytes()[:1] == bytes([8])
+
+
+def test_two_processes_share_the_work(tmp_path: Path) -> None:
+    def make(number: int) -> tuple[bytes, int]:
+        """Bytes that tell the number."""
+        return bytes([number]) * 512, 7
+
+    make_shards(tmp_path, make, 24, (1, 2), print)
+    assert [file.name for file in tmp_path.iterdir()] == [shard_file(tmp_path, 1).name]
+
+
+def test_things_stand_inside_of_the_room_and_not_in_each_other(furniture: Furniture) -> None:
+    rng = np.random.default_rng(0)
+    window = Opening("back", 1.0, 1.5, 0.9, 2.0, "window")
+    door = Opening("left", 0.5, 0.9, 0.0, 2.0, "door")
+    place = Place(rng, 4.0, 4.0, 2.5, [window, door])
+    for _ in range(30):
+        place.at_wall(furniture.of("bookcase"))
+        place.on_floor(furniture.of("chair"))
+    assert len(place.things) > 4
+    boxes = [thing.box for thing in place.things]
+    for number, one in enumerate(boxes):
+        assert min(one.x0, one.y0) >= 0
+        assert max(one.x1, one.y1) <= 4
+        assert not any(one.meets(other) for other in boxes[:number])
+        # High things stand before no window, and nothing before the door.
+        before_window = Box(1.0, 3.6, 2.5, 4.0, 0.9, 2.0)
+        assert one.z1 < 1.0 or not one.meets(before_window)
+    assert not any(box.meets(place._before(door)) for box in boxes)
+
+
+def test_small_things_stand_on_the_height_that_the_catalogue_gives(furniture: Furniture) -> None:
+    rng = np.random.default_rng(0)
+    place = Place(rng, 4.0, 4.0, 2.5, [])
+    desk = place.at_wall(furniture.of("desk"))
+    assert desk is not None
+    found = place.on_top(desk, furniture.of("living_small"), 4)
+    assert found
+    assert {thing.z for thing in found} == {0.74}
+    for thing in found:
+        assert desk.box.x0 <= thing.x <= desk.box.x1
+        assert desk.box.y0 <= thing.y <= desk.box.y1
+    plant = place.on_floor(furniture.of("floor_plant"))
+    assert plant is not None
+    assert place.on_top(plant, furniture.of("living_small"), 1) == []
+
+
+def test_outlines_are_mixed_and_depth_is_not(furniture: Furniture, cache: Path) -> None:
+    from worlds.caster import World
+    from worlds.meshes import Material, joined, quad
+    from worlds.viewpoints import Viewpoint
+
+    from spackle.core.camera import Camera
+
+    black = quad((-9, 4, -9), (18, 0, 0), (0, 0, 18), Material((0, 0, 0)))
+    bright = quad((0.03, 2, -9), (9, 0, 0), (0, 0, 18), Material((1, 1, 1), emission=1.0))
+    world = World(joined([black, bright]), {})
+    axes = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
+    viewpoint = Viewpoint(np.zeros(3, np.float32), axes, Camera.from_focal(20.0, 16, 8))
+    dark = {
+        "sky": np.zeros((4, 8, 3), np.float32),
+        "sun_direction": np.array([0, 0, 1], np.float32),
+        "sun_color": np.zeros(3, np.float32),
+        "sun_spread": 0.0,
+        "portals": np.zeros((0, 3, 3), np.float32),
+        "lamp_positions": np.zeros((0, 3), np.float32),
+        "lamp_radii": np.zeros(0, np.float32),
+        "lamp_colors": np.zeros((0, 3), np.float32),
+    }
+    lights = views.Lights(**dark)  # type: ignore[arg-type]
+    (view,) = views.render(np.random.default_rng(0), world, lights, viewpoint, [viewpoint.camera])
+    # The outline is at 0.3 pixels right of the middle.
+    row = view.radiance[4, :, 0]
+    assert row[7] < 0.1
+    assert 0.3 < row[8] < 0.95
+    assert row[9] > 0.95
+    assert set(np.round(view.depth.reshape(-1), 3).tolist()) == {2.0, 4.0}
+    np.testing.assert_allclose(view.normal[4, 9], [0, 0, -1], atol=1e-5)
