@@ -32,9 +32,12 @@ LAMP_RAYS = 4  # of a cell towards each lamp
 BOUNCES = 6
 COARSE_SAMPLES = 12  # places at which sunlight is looked for, for each coarse cell on average
 EMPTY = -1
-# Noise of gathered light is about a fifth, and it varies slowly; that of direct light is less.
-GATHERED_STRIDES, GATHERED_TOLERANCE = (1, 2, 3, 1), 0.6
-DIRECT_STRIDES, DIRECT_TOLERANCE = (1, 1), 0.5
+MAX_RAY_RATIO = 4.0  # a ray may be this many times as bright as the mean of its cell
+# Noise of gathered light is about a fifth, and it varies slowly; that of direct light is less. The
+# first round takes any neighbour, so that single outliers vanish.
+ANY = 1e3
+GATHERED_ROUNDS = ((1, ANY), (2, 0.6), (3, 0.5), (1, 0.5))
+DIRECT_ROUNDS = ((1, ANY), (2, 0.4), (1, 0.4))
 CHUNK = 400_000  # rays at once
 
 
@@ -168,12 +171,12 @@ def solve(
     fine_link = np.full(len(missed), EMPTY, np.int64)
     fine_link[~missed] = link
     reflected = np.concatenate([albedo * light, np.zeros((1, 3), np.float32)])
-    gathered = reflected[fine_link.reshape(count, GATHER_RAYS)].mean(1)
+    gathered = _calm_mean(reflected[fine_link.reshape(count, GATHER_RAYS)])
     gathered = gathered + math.pi * lights.ambient
     gathered += _sky_light(lights, world, rng, cells.position, cells.normal, missed, GATHER_RAYS)
-    gathered = _smoothed(cells, gathered.astype(np.float32), GATHERED_STRIDES, GATHERED_TOLERANCE)
+    gathered = _smoothed(cells, gathered.astype(np.float32), GATHERED_ROUNDS)
     direct = _direct(world, lights, rng, cells.position, cells.normal)
-    direct = _smoothed(cells, direct, DIRECT_STRIDES, DIRECT_TOLERANCE)
+    direct = _smoothed(cells, direct, DIRECT_ROUNDS)
     total = gathered + direct
     return Irradiance(
         cells,
@@ -185,6 +188,17 @@ def solve(
         angle,
         total.mean(0).astype(np.float32),
     )
+
+
+def _calm_mean(light: Floats) -> Floats:
+    """[N, 3] the mean over rays [N, R, 3], without single rays that outshine all others.
+
+    A ray that happens to end in a patch of sunlight would make a bright spot of its cell.
+    """
+    brightness = light.sum(-1)
+    limit = MAX_RAY_RATIO * brightness.mean(1, keepdims=True)
+    scale = np.minimum(1, limit / np.maximum(brightness, 1e-9))
+    return np.asarray((light * scale[..., None]).mean(1), np.float32)
 
 
 def _mean(values: Floats) -> Floats:
@@ -323,7 +337,7 @@ def _from_portals(
     total = np.zeros((len(positions), 3), np.float32)
     if not count:
         return total
-    each = max(4, PORTAL_RAYS // count)
+    each = max(9, PORTAL_RAYS // count)
     grid = math.ceil(math.sqrt(each))
     for corner, side, other in lights.portals:
         area_normal = np.cross(side, other)
@@ -449,17 +463,17 @@ def _sky_light(
     return np.asarray(math.pi * (openness * side)[:, None] * above, np.float32)
 
 
-def _smoothed(cells: Cells, light: Floats, strides: tuple[int, ...], tolerance: float) -> Floats:
+def _smoothed(cells: Cells, light: Floats, rounds: tuple[tuple[int, float], ...]) -> Floats:
     """[C, 3] the light of cells, averaged with neighbours of the same surface, against noise.
 
     Args:
         cells: the cells.
         light: [C, 3] irradiance.
-        strides: distance to the neighbours in cells, in each round.
-        tolerance: neighbours count less if their light differs by a larger share.
+        rounds: for each round the distance to the neighbours in cells, and the share by which
+            their light may differ before they count less.
     """
     base = np.float32(BASE_CELL_M)
-    for stride in strides:
+    for stride, tolerance in rounds:
         result = light.copy()
         _smooth(
             cells.table, cells.slots, cells.position, cells.normal, light, base, stride,

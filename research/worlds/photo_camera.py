@@ -52,7 +52,7 @@ def choose_development(rng: Rng, radiance: Floats) -> Development:
         glare=float(rng.uniform(0.01, 0.06)),
         vignette=float(rng.uniform(0.0, 0.25)),
         blur_px=float(rng.choice([0.0, rng.uniform(0.3, 0.6)], p=[0.4, 0.6])),
-        noise=float(abs(rng.normal(0, 0.012))),
+        noise=float(abs(rng.normal(0, 0.008))),
         jpeg=int(rng.integers(70, 97)),
     )
 

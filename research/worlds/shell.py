@@ -117,7 +117,8 @@ def wall_with_openings(
         parts.append(frame.block(start - thin, start, low, high, 0.001, WALL_M, paint))
         parts.append(frame.block(right, right + thin, low, high, 0.001, WALL_M, paint))
         parts.append(frame.block(start, right, high, high + thin, 0.001, WALL_M, paint))
-        parts.append(frame.block(start, right, low - thin, low, 0.001, WALL_M, paint))
+        if low > 0:
+            parts.append(frame.block(start, right, low - thin, low, 0.001, WALL_M, paint))
         left = right
     parts.append(frame.panel(left, length, 0, height, material, tile_m))
     return parts
