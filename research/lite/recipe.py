@@ -10,6 +10,7 @@ from typing import Annotated
 
 from depth_loss import DepthLossWeights
 from frames import Group, Measured, of_camera, of_scenes
+from made_rooms import RoomView, of_rooms
 from pydantic import Field
 
 from spackle.bases.lite import SIDE_MULTIPLE, STAGES, EncoderSize
@@ -40,6 +41,7 @@ class LiteShares(RecipePart):
     stereo: NonNegative = 0.28
     rgbd: NonNegative = 0.14
     guessed: NonNegative = 0.18  # only with a teacher
+    worlds: NonNegative = 0.3  # only with data.worlds
 
 
 class LiteData(RecipePart):
@@ -52,6 +54,7 @@ class LiteData(RecipePart):
         tuple[RgbdFolder, ...], MAY_CHANGE_ON_RESUME
     ] = ()  # their focal lengths are not used
     stereo: OptionalPath = None  # a folder of scenes, each with a scene.json
+    worlds: OptionalPath = None  # a folder of furnished rooms, made by research/worlds
     made: Count = 4900  # number of synthetic scenes
     teacher: Path | None = (
         None  # weights of an earlier run; its predictions for `photos` become training data
@@ -112,6 +115,7 @@ class LiteFiles:
     stereo: Sequence[Measured]
     rgbd: Sequence[Measured]
     guessed: Sequence[Path]  # photos for which the teacher makes guesses
+    worlds: Sequence[RoomView]
     groups: Sequence[Group]
 
     @staticmethod
@@ -143,12 +147,13 @@ class LiteFiles:
             stereo if shares.stereo else (),
             rgbd if shares.rgbd else (),
             _spread(photos, data.guesses) if shares.guessed and data.teacher is not None else (),
+            of_rooms(data.worlds) if shares.worlds and data.worlds is not None else (),
             _with_own_names([group for group in groups if group.files]),
         )
-        if not (files.photos or files.stereo or files.rgbd or files.guessed):
+        if not (files.photos or files.stereo or files.rgbd or files.guessed or files.worlds):
             raise InputError(
-                "the recipe has no data: give data.photos=FOLDER, data.rgbd or data.stereo, and a "
-                "share above 0"
+                "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or "
+                "data.worlds, and a share above 0"
             )
         if not files.groups:
             raise InputError(
@@ -188,13 +193,14 @@ class LiteFiles:
     def digest(self) -> str:
         """Twelve digits that identify all training and validation data."""
         facts = self.data.model_dump(mode="json")
-        for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd", "teacher"):
+        for name in ("photos", "stereo", "worlds", "validation_stereo", "cache", "rgbd", "teacher"):
             facts.pop(name)
         names = [
             _names(files)
             for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))
         ]
-        return short_digest((self.scenes_digest, self.guesses_digest, facts, names))
+        rooms = [(view.archive.name, view.key, view.number) for view in self.worlds]
+        return short_digest((self.scenes_digest, self.guesses_digest, facts, names, rooms))
 
 
 def _spread(photos: Sequence[Path], count: int) -> Sequence[Path]:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, cast
 import torch
 from depth_loss import MEASURES, DepthJudge
 from frames import JUDGED_SIDE, LEARNED_SIDE, Frame, read_all
+from made_rooms import Rooms
 from mixture import DepthBatch, Drawn, GuessedPhotos, Kept, Mixture, Source
 from recipe import LiteFiles, LiteRecipe
 from synthetic_scenes import SyntheticScenes, Warn
@@ -103,6 +104,8 @@ class LiteTask(Task):
                 lambda step, warn: guesses.fill(LiteBase.load(teacher, device=device), step, warn),
             )
             sources.append((guesses, shares.guessed))
+        if files.worlds:
+            sources.append((Rooms(files.worlds), shares.worlds))
         self.groups_of_frames = {
             group.name: [frame for _, frame in read_all(group.files, JUDGED_SIDE, log)]
             for group in files.groups
@@ -113,6 +116,7 @@ class LiteTask(Task):
             "rgbd": len(files.rgbd),
         }
         counts |= {"guessed": len(files.guessed)} if files.guessed else {}
+        counts |= {"room views": len(files.worlds)} if files.worlds else {}
         judged = {name: len(frames) for name, frames in self.groups_of_frames.items()}
         log(f"to learn from: {_listed(counts)}; to be judged by: {_listed(judged)}")
 

@@ -1,0 +1,99 @@
+"""Furnished rooms of `research/worlds` as a source of frames.
+
+The archives are described in research/worlds/shards.py; reading them needs nothing of that folder.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import tarfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from frames import MADE, Frame, Rng, Turning
+from PIL import Image
+
+from spackle.paper.dataset.encoding import decode_depth, decode_png
+from spackle.paper.training.measured_photos import find_files
+from spackle.runtime.errors import as_input_error
+
+ARCHIVES = ("worlds-",)  # how the names of archives begin
+SURFACE, SKY = 1, 2  # values of the validity picture; 0: seen through glass
+
+
+@dataclasses.dataclass(frozen=True)
+class RoomView:
+    """A view of a room in an archive; view 0 is the photo."""
+
+    archive: Path
+    key: str
+    number: int
+
+    @property
+    def name(self) -> str:
+        """The view's name in messages."""
+        return f"{self.archive} {self.key}.{self.number:02d}"
+
+    def read(self) -> Frame:
+        """Read the view; the photo as a camera made it. InputError if the archive is damaged."""
+        name = f"{self.key}.{self.number:02d}"
+        color_name = f"{self.key}.photo.jpg" if self.number == 0 else f"{name}.rgb.jpg"
+        with (
+            as_input_error(self.name, "no made room, or damaged: {reason}"),
+            tarfile.open(self.archive) as tar,
+        ):
+            facts = json.loads(_content(tar, f"{self.key}.json"))["views"][self.number]
+            with Image.open(io.BytesIO(_content(tar, color_name)), formats=["JPEG"]) as picture:
+                pixels = np.array(picture.convert("RGB"))
+            depth = decode_depth(_content(tar, f"{name}.depth.png"), *facts["depth_range"])
+            valid = torch.from_numpy(decode_png(_content(tar, f"{name}.valid.png"), axis_count=2))
+
+        # The sky is infinitely far; what stands behind glass has two depths, so it has none.
+        inverse_depth = torch.where(valid == SURFACE, 1 / depth.clamp_min(1e-6), 0.0)
+        known = (valid == SKY) | ((valid == SURFACE) & (depth > 0))
+        rgb = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
+        return Frame(rgb.contiguous(), inverse_depth, known)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rooms:
+    """Views of made rooms as a source; they are read when they are drawn."""
+
+    views: Sequence[RoomView]
+    turning: Turning = MADE
+    mingles: float = 0.2
+
+    def draw(self, rng: Rng) -> tuple[str, Frame]:
+        """As `mixture.Source` has it."""
+        view = self.views[int(rng.integers(len(self.views)))]
+        return f"room {view.name}", view.read()
+
+
+def of_rooms(folder: Path) -> list[RoomView]:
+    """All views of all rooms below a folder; InputError if there are none, or one is damaged."""
+    views = []
+    for archive in find_files(folder, "data.worlds", (".tar",), "archives worlds-NNNNN.tar"):
+        if not archive.name.startswith(ARCHIVES):
+            continue
+        with (
+            as_input_error(str(archive), "no made rooms, or damaged: {reason}"),
+            tarfile.open(archive) as tar,
+        ):
+            names = tar.getnames()
+        for name in names:
+            if name.endswith(".depth.png"):
+                key, number = name.removesuffix(".depth.png").split(".")
+                views.append(RoomView(archive, key, int(number)))
+    return views
+
+
+def _content(tar: tarfile.TarFile, name: str) -> bytes:
+    """A file's content; KeyError if it is missing."""
+    file = tar.extractfile(name)
+    if file is None:
+        raise KeyError(name)
+    return file.read()
