@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.core.image_formats import PHOTO_SUFFIXES
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import list_files
 from spackle.runtime.folders import file_lock, make_folder
