@@ -28,9 +28,8 @@ TIMED_WORK_NOTE = (
     "Base time: from the photo in memory to its Gaussians, and one rendering of the view. Spackle "
     "time: the base's time, in whose rendering the holes are found, and all that completion adds: "
     "mask, initial Gaussians, the inputs that the network names, the network, and a second "
-    "rendering of the view with the added Gaussians. If a network names the photo, or a method "
-    "guards it, a rendering at the photo's camera is included. No run uses what another has "
-    "computed."
+    "rendering of the view with the added Gaussians. A method that keeps Gaussians behind what "
+    "the photo shows also renders the photo's own view. No run uses what another has computed."
 )
 # Which second photos near views were compared with, by `SecondViews`.
 SECOND_VIEWS_TEXTS = {
