@@ -495,6 +495,37 @@ def test_plain_colours_are_fractions_by_their_type(tmp_path: Path) -> None:
     assert_same(load_scene(path).gaussians, GAUSSIANS, EXACT)
 
 
+def some_nan(count: int) -> dict[str, Any]:
+    """The columns of 200 Gaussians, the first ones not finite."""
+    table = inria_table(random_gaussians(200))
+    table["scale_0"] = table["scale_0"].copy()
+    table["scale_0"][:count] = math.nan
+    return table
+
+
+def test_a_few_gaussians_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+    path = write(tmp_path, {"a.ply": ply(some_nan(2))})
+    found = load_scene(path)
+    assert_same(found.gaussians, random_gaussians(200).select(slice(2, None)), EXACT)
+    assert found.notes == ("2 Gaussians that are not finite are left out",)
+    glb = khr_gltf(random_gaussians(200))
+    place = bytearray(glb.body)
+    place[:4] = struct.pack("<f", math.nan)
+    glb.body = bytes(place)
+    other = load_scene(write(tmp_path, {"a.glb": glb.glb()}))
+    assert len(other.gaussians) == 199
+    assert "1 Gaussians that are not finite" in other.losses[0]
+
+
+@pytest.mark.parametrize(("count", "comment"), [(3, "by a test"), (2, "spackle_base 150")])
+def test_many_of_them_or_some_in_a_completed_scene_are_refused(
+    count: int, comment: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path, {"a.ply": ply(some_nan(count), comments=(comment,))})
+    with pytest.raises(InputError, match=f"{count} of 200 Gaussians are not finite"):
+        load_scene(path)
+
+
 def test_rotations_of_all_axes_are_proper(tmp_path: Path) -> None:
     path = write(tmp_path, ROWS["SPZ, other axes"].files())
     rotations = quat_to_matrix(load_scene(path).gaussians.quats)

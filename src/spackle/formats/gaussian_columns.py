@@ -22,6 +22,10 @@ SH_C0 = 0.28209479177387814
 MIN_SCALE = 1e-37
 MAX_SCALE = 1e37
 
+# Training leaves a few Gaussians that are NaN, which every viewer leaves out. A file with a larger
+# share of them is broken.
+MAX_BROKEN_RATIO = 0.01
+
 # A shorter quaternion has no direction.
 MIN_QUAT_LENGTH = 1e-12
 
@@ -66,10 +70,10 @@ class GaussianColumns:
         )
 
     def to_gaussians(self) -> Gaussians:
-        """Convert the columns to Gaussians on the CPU.
+        """Convert the columns to Gaussians on the CPU, without those that are not finite.
 
         Raises:
-            ValueError: a value is not finite.
+            ValueError: more than MAX_BROKEN_RATIO of the Gaussians are not finite.
         """
         # A large logarithm gives an infinite scale, which is refused below.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -81,11 +85,12 @@ class GaussianColumns:
         for column in columns:
             is_finite &= np.isfinite(column.reshape(count, -1)).all(axis=1)
         broken_count = count - np.count_nonzero(is_finite)
-        if broken_count > 0:
+        if broken_count > MAX_BROKEN_RATIO * count:
             raise ValueError(f"{broken_count} of {count} Gaussians are not finite")
 
+        kept_rows = is_finite if broken_count else slice(None)
         means, quats, scale_tensor, opacities, srgb = (
-            torch.from_numpy(np.array(column, np.float32)) for column in columns
+            torch.from_numpy(np.array(column[kept_rows], np.float32)) for column in columns
         )
         return Gaussians(means, quats, scale_tensor, opacities, srgb_to_linear(srgb))
 

@@ -21,10 +21,15 @@ from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.formats.camera_files import checked_camera
 from spackle.formats.compressed_ply import PACKED_PROPERTIES, decode_compressed_ply
-from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
+from spackle.formats.gaussian_columns import (
+    MAX_BROKEN_RATIO,
+    Floats,
+    GaussianColumns,
+    harmonics_to_srgb,
+)
 from spackle.formats.ply_layout import NoGaussiansError, PlyLayout, plain_name
 from spackle.formats.ply_tables import NewTable, PlyElement, PlyTables, ply_header
-from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_content import SceneFile, left_out_note
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path
 
@@ -182,16 +187,21 @@ class PlyFile:
         camera = self.camera()
         base_count = self.base_count()
         disparity = self.disparity()
+        notes = self._notes()
+        gaussians = self.gaussians()
+        broken_count = self._vertex_element().row_count - len(gaussians)
+        if broken_count:
+            notes = (*notes, left_out_note(broken_count))
         return SceneFile(
             path=Path(self.path),
-            gaussians=self.gaussians(),
+            gaussians=gaussians,
             camera=camera,
             base_count=base_count,
             disparity=disparity,
             format=self._format(),
             writer=self._tables.generator,
             harmonics_degree=self._harmonics_degree(),
-            notes=self._notes(),
+            notes=notes,
             byte_count=self._tables.file_bytes,
         )
 
@@ -223,8 +233,11 @@ class PlyFile:
         The properties may have any order and type. Spherical harmonics above degree 0 (f_rest)
         are ignored.
 
+        A few Gaussians that are not finite, which training leaves behind, are left out; of a scene
+        that Spackle completed, none is.
+
         Raises:
-            InputError: there are no Gaussians, or some contain NaN or inf. An infinite logit
+            InputError: there are no Gaussians, or too many contain NaN or inf. An infinite logit
                 of an opacity is allowed: SHARP writes one for an opacity of 1.
         """
         vertex = self._vertex_element()
@@ -252,18 +265,23 @@ class PlyFile:
 
         # One array serves all blocks; a row holds one property.
         block = np.zeros((BLOCK_HEIGHT, ROWS_PER_BLOCK), np.float32)
-        broken_count = 0
+        is_finite = np.empty(count, bool)
         for start in range(0, count, ROWS_PER_BLOCK):
             block_rows = rows[start : start + ROWS_PER_BLOCK]
             stop = start + len(block_rows)
-            broken_count += _convert_block(block, block_rows, layout, are_linear)
+            is_finite[start:stop] = _convert_block(block, block_rows, layout, are_linear)
             for tensor, group in groups:
                 tensor[start:stop] = torch.from_numpy(block[group, : len(block_rows)].T)
 
-        if broken_count > 0:
+        gaussians = Gaussians(means, quats, scales, opacities[:, 0], colors)
+        broken_count = count - int(np.count_nonzero(is_finite))
+        if broken_count == 0:
+            return gaussians
+        # The numbers of base and aux Gaussians would no longer fit a scene of Spackle.
+        if broken_count > MAX_BROKEN_RATIO * count or self.base_count() is not None:
             problem = f"{broken_count} of {count} Gaussians are not finite"
             raise InputError(f"{self.path}: {problem}: export it again")
-        return Gaussians(means, quats, scales, opacities[:, 0], colors)
+        return gaussians.select(torch.from_numpy(is_finite))
 
     def camera(self) -> Camera | None:
         """Read the photo's camera.
@@ -408,7 +426,9 @@ class PlyFile:
         )
 
 
-def _convert_block(block: Floats, rows: NDArray[Any], layout: PlyLayout, are_linear: bool) -> int:
+def _convert_block(
+    block: Floats, rows: NDArray[Any], layout: PlyLayout, are_linear: bool
+) -> NDArray[np.bool_]:
     """Convert rows of a PLY file to means, linear colours, opacities, scales and quaternions.
 
     Args:
@@ -421,7 +441,7 @@ def _convert_block(block: Floats, rows: NDArray[Any], layout: PlyLayout, are_lin
         are_linear: whether the colours are linear RGB; else they are sRGB.
 
     Returns:
-        How many of the Gaussians are not finite.
+        [len(rows)] which of the Gaussians are finite.
     """
     count = len(rows)
     block[MEANS, :count] = layout.read_means(rows)
@@ -436,6 +456,6 @@ def _convert_block(block: Floats, rows: NDArray[Any], layout: PlyLayout, are_lin
     block[OPACITIES] = torch.from_numpy(block[OPACITIES]).sigmoid()
 
     # The colours are checked before their conversion, which would make infinite ones finite.
-    is_finite = np.isfinite(block[:, :count]).all(axis=0)  # [len(rows)]
+    is_finite = np.asarray(np.isfinite(block[:, :count]).all(axis=0))
     block[COLORS] = rgb.clamp_min(0) if are_linear else srgb_to_linear(rgb)
-    return int(np.count_nonzero(~is_finite))
+    return is_finite

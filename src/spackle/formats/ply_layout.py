@@ -81,7 +81,7 @@ class PlyLayout:
         if missing:
             problem = f"its vertices have no {', '.join(missing)}"
             if not set(SCALES) & set(types):
-                problem += ", as those of point clouds and meshes"
+                problem += ", as those of point clouds and meshes: give a scene of Gaussians"
             raise NoGaussiansError(problem)
 
         opacity_name = next((name for name in ("opacity", "alpha") if name in types), None)
@@ -104,7 +104,9 @@ class PlyLayout:
         """What had to be assumed about Gaussians, each in a few words."""
         notes = []
         if len(self.scales) == 2:
-            notes.append("its flat discs (2D Gaussian splatting) get a thousandth of their radius")
+            notes.append(
+                "its flat discs (2D Gaussian splatting) are made a thousandth of their radius thick"
+            )
         if self.opacity is None:
             notes.append("it has no opacities: all Gaussians are opaque")
         return tuple(notes)

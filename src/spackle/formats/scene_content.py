@@ -19,6 +19,11 @@ class UnsupportedSceneError(ValueError):
     """A file that may be sound, but is not read; the text says what it is, and what to do."""
 
 
+def left_out_note(broken_count: int) -> str:
+    """The words for Gaussians that are left out because they are not finite."""
+    return f"{broken_count:,} Gaussians that are not finite are left out"
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DecodedScene:
     """What a reader finds in a file; all but the Gaussians may be unknown."""

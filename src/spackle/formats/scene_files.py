@@ -12,7 +12,12 @@ from spackle.formats.compressed_ply import encode_compressed_ply
 from spackle.formats.gltf import encode_glb
 from spackle.formats.gltf_reader import read_gltf
 from spackle.formats.ply import PlyFile, encode_ply
-from spackle.formats.scene_content import DecodedScene, SceneFile, UnsupportedSceneError
+from spackle.formats.scene_content import (
+    DecodedScene,
+    SceneFile,
+    UnsupportedSceneError,
+    left_out_note,
+)
 from spackle.formats.sog import META_NAME, encode_sog
 from spackle.formats.sog_reader import is_sog_archive, read_sog, sog_byte_count
 from spackle.formats.splat import decode_splat, encode_splat
@@ -144,6 +149,11 @@ def load_scene(path: Path) -> SceneFile:
             raise ValueError("it holds no Gaussians")
         gaussians = decoded.columns.to_gaussians()
 
+    notes = decoded.notes
+    broken_count = len(decoded.columns.means) - len(gaussians)
+    if broken_count:
+        notes = (*notes, left_out_note(broken_count))
+
     is_unbundled_sog = path.is_dir() or path.name.lower().endswith(META_NAME)
     writer = decoded.writer
     return SceneFile(
@@ -154,7 +164,7 @@ def load_scene(path: Path) -> SceneFile:
         format=decoded.format,
         writer=None if writer is None else printable_line(writer)[:MAX_WRITER_LENGTH],
         harmonics_degree=decoded.harmonics_degree,
-        notes=decoded.notes,
+        notes=notes,
         byte_count=sog_byte_count(path) if is_unbundled_sog else path.stat().st_size,
     )
 
