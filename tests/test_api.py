@@ -136,11 +136,11 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
         (b"\xff\xd8" + bytes(100_000), {}, "photo: not an image"),
         ("x" * 100_000, {}, "xxx"),
         (io.StringIO("x" * 100_000), {}, "binary mode"),
-        (np.zeros((48, 64)), {}, "[H, W, 3]"),
+        (np.zeros((48, 64, 5)), {}, "[H, W, 3]"),
         (np.zeros((3, 64, 3)), {}, "64×3 is too small"),
         (np.full((48, 64, 3), 200.0), {}, "from 200 to 200"),
         (object(), {}, "a path, bytes"),
-        (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64), complex)}, "metres"),
+        (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64), complex)}, "integers or floats"),
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64))}, "all-invalid"),
         (
             np.zeros((48, 64, 3)),

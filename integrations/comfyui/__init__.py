@@ -27,7 +27,13 @@ from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
-from spackle.depth.units import RELATIVE_FAR_M, RELATIVE_KINDS, RELATIVE_NEAR_M, relative_depth
+from spackle.depth.units import (
+    RELATIVE_FAR_M,
+    RELATIVE_KINDS,
+    RELATIVE_NEAR_M,
+    StoredDepth,
+    relative_depth,
+)
 from spackle.formats.gaussian_columns import SH_C0
 from spackle.views import DEFAULT_FRAME_COUNT
 
@@ -105,7 +111,8 @@ class PredictScene:
             greys = depth[0].detach().float().cpu().mean(dim=-1).numpy()
             # of 8 bits
             eighth = 1 / 255 if np.allclose(255 * greys, np.round(255 * greys), atol=0.01) else None
-            given = relative_depth(greys, depth_kind, "depth", near, far, eighth)
+            stored = StoredDepth(greys, Path("depth"))
+            given = relative_depth(stored, depth_kind, near, far, eighth)
             base = open_base(BaseSettings(depth=given))
         prediction, _ = base.predict(photo)
         return (Scene(prediction.gaussians, Gaussians.empty(), prediction.camera),)

@@ -11,9 +11,8 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol, TypeGuard
 
-import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -21,11 +20,12 @@ from torch import Tensor
 from spackle.bases import Base
 from spackle.bases.open import open_base, wrap_loaded_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
+from spackle.core.array_values import is_array_like
 from spackle.core.photo import Photo, load_photo, photo_from_picture
 from spackle.core.trajectories import TrajectoryKind
 from spackle.depth.depth_map import DepthMap
-from spackle.depth.readers import load_depth
-from spackle.depth.units import DepthKind, depth_from_array
+from spackle.depth.readers import DepthValue
+from spackle.depth.units import DepthKind
 from spackle.pipeline import FillMode, FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
@@ -34,9 +34,18 @@ from spackle.runtime.progress import LogReporter
 from spackle.scene import Scene
 from spackle.views import PathOptions
 
-Pixels = NDArray[Any] | Tensor
-PhotoSource = str | os.PathLike[str] | bytes | BinaryIO | Image.Image | Pixels | Photo
-DepthSource = str | os.PathLike[str] | bytes | BinaryIO | Pixels | DepthMap
+
+class ArrayLike(Protocol):
+    """An array of another package, such as xarray, JAX or CuPy."""
+
+    def __array__(self) -> NDArray[Any]:
+        """The same numbers as a NumPy array."""
+
+
+Pixels = NDArray[Any] | Tensor | Image.Image | ArrayLike
+FileSource = str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryIO
+PhotoSource = FileSource | Pixels | Photo
+DepthSource = FileSource | Pixels | DepthMap
 Residual = str | os.PathLike[str] | ResidualNet | None
 
 
@@ -115,6 +124,7 @@ class Spackle:
         trajectory: TrajectoryKind = "rotate-forward",
         disparity: float | None = None,
         depth_kind: DepthKind = "auto",
+        depth_unit: str | float | None = None,
         keep_frame: bool = False,
         focal_px: float | None = None,
         focal_mm: float | None = None,
@@ -148,8 +158,8 @@ class Spackle:
         # cameras: these belong to the whole picture, frame included.
         with contextlib.ExitStack() as open_files:
             if depth is not None:
-                depth_source = open_files.enter_context(_open_depth(depth, depth_kind))
-                pipeline = _with_depth(pipeline, depth_source, depth_kind)
+                depth_source = open_files.enter_context(_open_depth(depth))
+                pipeline = _with_depth(pipeline, depth_source, depth_kind, depth_unit)
             loaded_photo = open_files.enter_context(
                 _open_photo(
                     photo,
@@ -170,6 +180,7 @@ def predict(
     trajectory: TrajectoryKind = "rotate-forward",
     disparity: float | None = None,
     depth_kind: DepthKind = "auto",
+    depth_unit: str | float | None = None,
     residual: Residual = None,
     fill: FillTexture = "auto",
     mode: FillMode = "scene",
@@ -188,9 +199,10 @@ def predict(
 
     Args:
         photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an
-            array or tensor [H, W, 3] or [3, H, W] of sRGB as uint8 or as floats in 0..1.
-        depth: the photo's depth as a path, bytes or an open file in a format of `load_depth`, an
-            array or tensor [H, W] in metres (0, NaN or inf: unknown), or a loaded depth map.
+            array or tensor of sRGB as for `photo_from_picture`, such as [H, W, 3] of uint8.
+        depth: the photo's depth as a path, bytes or an open file in a format of `load_depth`, a
+            loaded depth map, or a PIL picture, array or tensor [H, W]: floats in metres, in which
+            0, NaN and inf are unknown, and so are the masked numbers of a masked array.
         base: what turns the photo into Gaussians, see `Spackle`.
         trajectory: the path for which the scene is completed, in addition to the leftmost and
             rightmost views.
@@ -198,6 +210,7 @@ def predict(
             `spackle.core.trajectories.disparity_to_offset`; None chooses it for the photo, with a
             limit of 0.15 for lite and 0.3 for other bases.
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
+        depth_unit: the unit of metric depth, such as "mm", "1/256" or 0.001.
         residual: the network that fills holes, see `Spackle`.
         fill: source of the texture in the holes, see `Spackle`.
         mode: one set of Gaussians for all views, or one for each view, see `Spackle`.
@@ -224,6 +237,7 @@ def predict(
         trajectory=trajectory,
         disparity=disparity,
         depth_kind=depth_kind,
+        depth_unit=depth_unit,
         keep_frame=keep_frame,
         focal_px=focal_px,
         focal_mm=focal_mm,
@@ -232,10 +246,17 @@ def predict(
     )
 
 
-def _with_depth(pipeline: Pipeline, depth: Path | DepthMap, depth_kind: DepthKind) -> Pipeline:
+def _with_depth(
+    pipeline: Pipeline,
+    depth: Path | DepthMap | DepthValue,
+    depth_kind: DepthKind,
+    depth_unit: str | float | None,
+) -> Pipeline:
     """The same pipeline, with a base that lifts a photo by this depth."""
     # The fill's network and the renderer stay open; only the base is opened anew, for this photo.
-    base_settings = dataclasses.replace(pipeline.options.base, depth=depth, depth_kind=depth_kind)
+    base_settings = dataclasses.replace(
+        pipeline.options.base, depth=depth, depth_kind=depth_kind, depth_unit=depth_unit
+    )
     return dataclasses.replace(
         pipeline,
         options=dataclasses.replace(pipeline.options, base=base_settings),
@@ -260,7 +281,7 @@ def _open_photo(
     # The focal length of a loaded photo is known; the caller has refused another one.
     if isinstance(source, Photo):
         yield source
-    elif isinstance(source, Image.Image | np.ndarray | Tensor):
+    elif _is_pixels(source):
         yield photo_from_picture(
             source, keep_frame=keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov
         )
@@ -272,28 +293,33 @@ def _open_photo(
 
 
 @contextlib.contextmanager
-def _open_depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
-    """Give a depth map in the form that a base takes, during the block: its path, or a loaded map.
+def _open_depth(source: DepthSource) -> Iterator[Path | DepthMap | DepthValue]:
+    """Give a depth map in a form that a base takes, during the block.
 
-    `kind` is the meaning of the numbers in an array or in bytes; a path's file is read, by the
-    base, with the kind of the base's settings.
+    A file's content lies in a temporary file until the block ends. The base reads it, because only
+    the base knows the photo, which shows whether the numbers can be metres.
     """
     if isinstance(source, DepthMap):
         yield source
     elif isinstance(source, str | os.PathLike):
-        # Not loaded here, because the base also looks for the calibration beside the file.
+        # The base also looks for the calibration beside the file.
         yield Path(source)
-    elif isinstance(source, Tensor):
-        yield depth_from_array(source.detach().cpu().numpy(), Path("depth"), kind)
-    elif isinstance(source, np.ndarray):
-        yield depth_from_array(source, Path("depth"), kind)
+    elif _is_pixels(source):
+        yield DepthValue(source)
     else:
         with _as_file(source, "depth") as path:
-            yield load_depth(path, kind=kind)
+            yield path
+
+
+def _is_pixels(source: object) -> TypeGuard[Pixels]:
+    """Whether a photo or depth map is a value with pixels, and not a file or its content."""
+    # An open file or a path is never one, whatever methods its class adds.
+    is_file = isinstance(source, str | bytes | os.PathLike) or hasattr(source, "read")
+    return not is_file and is_array_like(source)
 
 
 @contextlib.contextmanager
-def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, name: str) -> Iterator[Path]:
+def _as_file(source: Any, name: str) -> Iterator[Path]:
     """Give the path of a file that holds the source's bytes, during the block.
 
     A path is given as it is; bytes, and the content of an open file, go into a temporary file.
@@ -312,6 +338,8 @@ def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, name: str) -> It
 
     # An open file is read from its current position, so a photo may lie inside a larger file.
     content = source.read() if hasattr(source, "read") else source
+    if isinstance(content, bytearray | memoryview):
+        content = bytes(content)
     # A file opened as text gives a str.
     if not isinstance(content, bytes):
         raise InputError(

@@ -26,6 +26,7 @@ from spackle.bases.settings import BaseSettings
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo, check_photo_size
+from spackle.depth.units import RELATIVE_KINDS, UNIT_ADVICE
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio
@@ -288,7 +289,7 @@ class Pipeline:
         if chooses_disparity:
             reporter.log(f"{name}: {describe_movement(prediction)}")
         if "depth_range" in prediction.notes:
-            reporter.log(f"{name}: its depth is {prediction.notes['depth_range']}")
+            reporter.log(f"{name}: {describe_depth(prediction.notes)}")
         for line in self._depth_warnings(prediction):
             warn(f"{name}: {line}")
         return PredictedPhoto(prediction=prediction, base=base, warnings=tuple(warnings))
@@ -303,7 +304,13 @@ class Pipeline:
         # Depth inside a photo's file is usually coarser than the photo, which is no news. A map
         # that the user gives should have the photo's size.
         map_size = prediction.notes.get("depth_resampled_from")
-        if map_size and self.options.base.depth is not None:
+        stretch = float(prediction.notes.get("depth_stretched", 0))
+        if stretch:
+            lines.append(
+                f"the depth map is {map_size}, as networks round sides, and was stretched by "
+                f"{stretch:.1%} to the photo's shape"
+            )
+        elif map_size and self.options.base.depth is not None:
             lines.append(f"the depth map is {map_size}, and was resampled to the photo's size")
         return lines
 
@@ -441,6 +448,22 @@ def measure_holes(scene: Scene, views: PlannedViews, renderer: Renderer) -> tupl
             )
         )
     return tuple(holes)
+
+
+def describe_depth(notes: Mapping[str, float | int | str]) -> str:
+    """A line for the log about a depth map: how it was understood, near, median and far.
+
+    `notes` are those of the base rgbd. If the meaning was guessed, the line says how to correct it.
+    """
+    if "depth_read_as" not in notes:
+        return f"its depth: {notes['depth_range']}"
+    line = f"depth read as {notes['depth_read_as']}: {notes['depth_range']}"
+    if notes["depth_unit"] != "guessed":
+        return line
+    return (
+        f"{line}; if that is wrong, give {UNIT_ADVICE}, or for relative depth "
+        f"`depth_kind` {' or '.join(RELATIVE_KINDS)}"
+    )
 
 
 def describe_movement(prediction: BasePrediction) -> str:

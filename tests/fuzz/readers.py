@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import gzip
 import hashlib
 import io
@@ -15,13 +16,15 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from helpers import DATA
 
 from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.core.keyframes import PathError
 from spackle.core.photo import load_photo, resize_photo
 from spackle.depth.in_photo.layouts import load_photo_depth
-from spackle.depth.readers import load_depth
+from spackle.depth.readers import DepthValue, load_depth
+from spackle.depth.units import parse_depth_unit
 from spackle.formats import PlyFile, load_cameras, load_path
 from spackle.formats.camera_readers import camera_source_files, is_path_file, read_camera_set
 from spackle.formats.scene_files import load_scene
@@ -34,7 +37,7 @@ from spackle.paper.evaluation.datasets import find_dataset, read_cases
 from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.runtime.digests import json_digest
-from spackle.runtime.errors import printable_line
+from spackle.runtime.errors import InputError, printable_line
 from spackle.weights.checkpoints import read_tensors
 
 Files = dict[str, bytes]  # name in the case's folder → content
@@ -97,6 +100,30 @@ def _only(folder: Path) -> Path:
 
 def _say(line: str) -> None:
     printable_line(line).encode()  # a report encodes its lines
+
+
+def _read_depth(folder: Path) -> None:
+    path = _only(folder)
+    # The bytes of a damaged file are also the text of a unit, and the numbers of a value.
+    content = path.read_bytes()
+    unit = content[:12].decode("latin-1")
+    bytes_of_value = content[-200:].ljust(200, b"\0")
+    values = [
+        np.frombuffer(bytes_of_value, dtype).reshape(shape)
+        for dtype, shape in ((">f4", (1, 5, 10)), ("<f2", (10, 10, 1)), ("<i8", (5, 5)))
+    ]
+    values.append(np.ma.masked_less(values[0], 1.0))
+    attempts: list[Callable[[], object]] = [
+        lambda: load_depth(path, kind="near-white"),
+        lambda: load_depth(path, unit="1/m"),
+        lambda: parse_depth_unit(unit),
+        *(partial(load_depth, DepthValue(value)) for value in values),
+        *(partial(load_depth, DepthValue(value), kind="near-black") for value in values),
+    ]
+    for attempt in attempts:
+        with contextlib.suppress(InputError):
+            attempt()
+    load_depth(path)
 
 
 def _read_ply(folder: Path) -> None:
@@ -167,7 +194,7 @@ def _read_clip(folder: Path) -> None:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "pictures": lambda folder: resize_photo(load_photo(_only(folder), keep_frame=False), 32),
-    "depth": lambda folder: load_depth(_only(folder)),
+    "depth": _read_depth,
     "portraits": lambda folder: load_photo_depth(_only(folder)),
     "ply": _read_ply,
     "foreign_scenes": _read_foreign_scene,

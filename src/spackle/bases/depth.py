@@ -10,7 +10,7 @@ from torch import Tensor
 from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.photo import Photo, replace_border, resize_photo
-from spackle.depth.depth_map import DepthMap
+from spackle.depth.depth_map import ASPECT_TOLERANCE, DepthMap
 from spackle.lifting.lift import lift_depth_map
 from spackle.lifting.quadtree import TILE_LEVELS
 from spackle.runtime.progress import Progress
@@ -48,6 +48,13 @@ class RgbdBase:
         notes = prediction.notes | {"depth_range": self.depth.range_in_words}
         if depth.note:
             notes["depth"] = depth.note
+        if depth.meaning:
+            notes["depth_read_as"] = depth.meaning
+            notes["depth_unit"] = "guessed" if depth.is_guess else "given"
+        framed_width, framed_height = photo.framed_size
+        stretch = self.depth.stretch_to(framed_height, framed_width)
+        if abs(stretch) > ASPECT_TOLERANCE:
+            notes["depth_stretched"] = round(abs(stretch), 4)
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
 
     def _cropped_to(self, photo: Photo) -> tuple[DepthMap, Camera | None]:

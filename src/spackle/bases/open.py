@@ -15,6 +15,7 @@ from pathlib import Path
 
 from spackle.bases import Base, BasePrediction
 from spackle.bases.depth import RgbdBase
+from spackle.bases.depth_order import CLEAR_CORRELATION, depth_order_agreement
 from spackle.bases.lite import LiteBase
 from spackle.bases.moge.base import MogeBase
 from spackle.bases.settings import (
@@ -32,8 +33,14 @@ from spackle.bases.transformers import HfBase
 from spackle.core.photo import Photo, resize_rgb
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.in_photo.layouts import load_photo_depth
-from spackle.depth.readers import find_depth_file, load_depth
-from spackle.depth.units import RELATIVE_FAR_M, RELATIVE_NEAR_M
+from spackle.depth.readers import DepthValue, find_depth_file, load_depth
+from spackle.depth.units import (
+    RELATIVE_FAR_M,
+    RELATIVE_NEAR_M,
+    UNIT_ADVICE,
+    DepthKind,
+    UnclearDepth,
+)
 from spackle.runtime.device import NotEnoughMemory
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.plugins import load_plugin
@@ -151,7 +158,7 @@ def _open_rgbd(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | Non
             )
         return None
 
-    depth_map = source if isinstance(source, DepthMap) else _read_depth(settings, source, photo)
+    depth_map = source if isinstance(source, DepthMap) else read_depth(settings, source, photo)
     # The map's own intrinsics K, if any, are taken unless the user gave a focal length.
     if depth_map.K is None or not photo.focal_source.is_from_user:
         return RgbdBase(depth_map)
@@ -163,25 +170,82 @@ def _open_rgbd(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | Non
     if isinstance(source, DepthMap):
         return RgbdBase(source.with_focal(focal_px), lens_source="")  # "": the user gave it
     # The file is read again, because the focal length converts its disparities to metres.
-    return RgbdBase(_read_depth(settings, source, photo, focal_px), lens_source="")
+    return RgbdBase(read_depth(settings, source, photo, focal_px), lens_source="")
 
 
-def _read_depth(
-    settings: BaseSettings, source: Path, photo: Photo, focal_px: float | None = None
+def read_depth(
+    settings: BaseSettings,
+    source: Path | DepthValue,
+    photo: Photo,
+    focal_px: float | None = None,
 ) -> DepthMap:
     """Read a photo's depth map from `source`, with the settings for reading it.
 
-    `source` is the map's file, or a folder with a map named like the photo. `focal_px`, in pixels
-    of the map, replaces the focal length in the map's calibration file.
+    Where the settings do not say what the numbers mean, the map's order from near to far is
+    compared with the photo.
+
+    Args:
+        settings: kind, unit and range of the map.
+        source: the map's file, a folder with a map named like the photo, or a map in memory.
+        photo: the photo that the map belongs to.
+        focal_px: in pixels of the map, replaces the focal length in the map's calibration file.
+
+    Raises:
+        InputError: the map cannot be read; or it is unclear whether it holds metres.
     """
-    return load_depth(
-        find_depth_file(source, photo.path),
-        focal_px=focal_px,
-        calib=settings.calib,
-        kind=settings.depth_kind,
-        near=RELATIVE_NEAR_M if settings.near is None else settings.near,
-        far=RELATIVE_FAR_M if settings.far is None else settings.far,
-    )
+    if not isinstance(source, DepthValue):
+        source = find_depth_file(source, photo.path)
+
+    def load(kind: DepthKind) -> DepthMap:
+        return load_depth(
+            source,
+            focal_px=focal_px,
+            calib=settings.calib,
+            kind=kind,
+            unit=settings.depth_unit,
+            near=RELATIVE_NEAR_M if settings.near is None else settings.near,
+            far=RELATIVE_FAR_M if settings.far is None else settings.far,
+        )
+
+    try:
+        depth_map = load(settings.depth_kind)
+    except UnclearDepth as error:
+        return _decided_by_photo(load, photo, error)
+    if depth_map.is_guess and depth_order_agreement(depth_map, photo) < -CLEAR_CORRELATION:
+        raise InputError(
+            f"{depth_map.path}: read as {depth_map.meaning}, what the photo shows near would be "
+            f"far: give `depth_kind` near-white for inverse depth, or {UNIT_ADVICE}"
+        )
+    return depth_map
+
+
+def _decided_by_photo(
+    load: Callable[[DepthKind], DepthMap], photo: Photo, error: UnclearDepth
+) -> DepthMap:
+    """The depth map that raised `error`, if the photo shows that it may be metric after all.
+
+    Args:
+        load: reads the map as the kind that it is called with.
+        photo: the photo that the map belongs to.
+        error: what is unclear.
+
+    Raises:
+        InputError: `error`, with the kind of relative depth that the photo shows, if it does.
+    """
+    # As inverse depth, any grey numbers can be read. Their order shows what they are.
+    try:
+        agreement = depth_order_agreement(load("near-white"), photo)
+    except InputError:
+        raise error from None
+    if abs(agreement) <= CLEAR_CORRELATION:
+        raise error
+    if agreement < 0 and error.may_be_metres:
+        return dataclasses.replace(load("metric"), is_guess=True)
+    kind = "near-white" if agreement > 0 else "near-black"
+    raise InputError(
+        f"{error.problem}, and the photo shows that bright is {'near' if agreement > 0 else 'far'}"
+        f": give `depth_kind` {kind}, or {UNIT_ADVICE} for metric depth"
+    ) from None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,8 @@ from rich.filesize import decimal
 from spackle.bases import lite
 from spackle.bases.sharp.base import check_window_batch
 from spackle.depth.depth_map import DepthMap
-from spackle.depth.units import DEPTH_KINDS, RELATIVE_KINDS, DepthKind
+from spackle.depth.readers import DepthValue
+from spackle.depth.units import DEPTH_KINDS, RELATIVE_KINDS, DepthKind, parse_depth_unit
 from spackle.runtime.device import PRECISIONS, Precision
 from spackle.runtime.errors import InputError, check_name
 from spackle.weights import PUBLISHED_WEIGHTS, installed_weights
@@ -26,7 +27,8 @@ HF_PREFIX = "hf:"  # before a folder, or a Hugging Face model's owner/name
 AUTO_NETWORKS = ("sharp", "moge", "lite")  # in the order that `auto` tries them
 NETWORK_BASES = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
 PLUGIN_KIND = "package.module:Class"
-DEPTH_READING_OPTIONS = ("depth_kind", "near", "far")  # how to read a depth map
+# How to read a depth map.
+DEPTH_READING_OPTIONS = ("depth_kind", "depth_unit", "near", "far")
 
 # What a model's folder may hold that predictions depend on.
 HF_FILE_PATTERNS: tuple[str, ...] = (
@@ -39,7 +41,7 @@ HF_FILE_PATTERNS: tuple[str, ...] = (
 )
 
 # A photo's depth; a path may be a folder of depth maps that are named like the photos.
-Depth = Path | DepthMap | None
+Depth = Path | DepthMap | DepthValue | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,6 +159,8 @@ class BaseSettings:
     depth: Depth = None
     calib: Path | None = None  # calibration of a disparity map
     depth_kind: DepthKind = "auto"  # what the numbers of a depth map are
+    # Unit of a metric depth map, see `parse_depth_unit`; None: that of its format.
+    depth_unit: str | float | None = None
     near: float | None = None  # nearest depth of a relative map in metres; None: 1.5
     far: float | None = None  # farthest depth of a relative map in metres; None: 15
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
@@ -274,11 +278,16 @@ class BaseSettings:
 
     def _given_options(self) -> dict[str, object]:
         """The options that only some bases take and that the user has set, with their values."""
+        # A depth map in memory is named instead of printed.
+        depth: object = self.depth
+        if isinstance(self.depth, DepthMap | DepthValue):
+            depth = self.depth.path
         # An option counts as set if its value is not the default, which is "auto" or None.
         options = {
-            "depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
+            "depth": depth,
             "calib": self.calib,
             "depth_kind": None if self.depth_kind == "auto" else self.depth_kind,
+            "depth_unit": self.depth_unit,
             "near": self.near,
             "far": self.far,
             "checkpoint": self.checkpoint,
@@ -312,9 +321,22 @@ class BaseSettings:
                     f"`{option}` {options[option]}: there is no depth map to read: "
                     "give the map with `depth`"
                 )
+            if isinstance(self.depth, DepthMap):
+                raise InputError(
+                    f"`{option}` {options[option]}: the depth map is loaded already: "
+                    f"give `{option}` where it is loaded"
+                )
             if option in ("near", "far") and self.depth_kind not in RELATIVE_KINDS:
                 # They say at which depths the map's nearest and farthest points are placed.
                 raise InputError(
                     f"`{option}` {options[option]}: only for relative maps: "
                     f"add `depth_kind` {' or '.join(RELATIVE_KINDS)}"
+                )
+        # A unit or a kind that cannot be is reported before the first photo is read.
+        if self.depth_unit is not None:
+            parse_depth_unit(self.depth_unit)
+            if self.depth_kind not in ("auto", "metric"):
+                raise InputError(
+                    f"`depth_unit` {self.depth_unit}: only for metric depth: "
+                    f"leave out `depth_kind` {self.depth_kind}"
                 )

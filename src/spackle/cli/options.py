@@ -79,6 +79,15 @@ DepthKindOption = Annotated[
         "auto: disparity if there is a calibration, else metric.",
     ),
 ]
+DepthUnitOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="UNIT",
+        help="Unit of --depth: m, cm, mm, km, or a number of metres, such as 1/256 for KITTI; "
+        "1/m: inverse depth.",
+        show_default="mm in a PNG, else m",
+    ),
+]
 
 # The server.
 HostOption = Annotated[

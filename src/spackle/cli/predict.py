@@ -15,6 +15,7 @@ from spackle.cli.options import (
     CheckpointOption,
     ConvergenceOption,
     DepthKindOption,
+    DepthUnitOption,
     DeviceOption,
     DisparityOption,
     FitOption,
@@ -76,6 +77,7 @@ def predict(
         ),
     ] = None,
     depth_kind: DepthKindOption = "auto",
+    depth_unit: DepthUnitOption = None,
     near: Annotated[
         float | None,
         typer.Option(
@@ -221,6 +223,7 @@ def predict(
         depth=depth,
         calib=calib,
         depth_kind=depth_kind,
+        depth_unit=depth_unit,
         near=near,
         far=far,
         checkpoint=checkpoint,

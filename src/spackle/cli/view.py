@@ -12,6 +12,7 @@ from spackle.cli.options import (
     INTERRUPTED,
     CheckpointOption,
     DepthKindOption,
+    DepthUnitOption,
     DeviceOption,
     FovOption,
     HostOption,
@@ -37,6 +38,7 @@ def view(
     ] = "auto",
     depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Depth of the photo.")] = None,
     depth_kind: DepthKindOption = "auto",
+    depth_unit: DepthUnitOption = None,
     checkpoint: CheckpointOption = None,
     disparity: Annotated[
         float | None,
@@ -73,7 +75,12 @@ def view(
 
     options = ViewOptions(
         base=BaseSettings(
-            name=base, depth=depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device
+            name=base,
+            depth=depth,
+            depth_kind=depth_kind,
+            depth_unit=depth_unit,
+            checkpoint=checkpoint,
+            device=device,
         ),
         disparity=disparity,
         focal_px=focal_px,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from spackle.core.array_values import PlainArray, plain_array, without_unit_axes
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource, resolve_focal_length
 from spackle.core.image_files import OpenPicture, check_pixel_count, exif_tags, read_picture
@@ -32,6 +33,9 @@ MIN_SIDE_PX = 32  # a smaller photo shows no scene
 MAX_ASPECT_RATIO = 8  # long to short side; a narrower photo shows no scene
 MAX_WORKING_SIDE_PX = 1536  # long side of a photo at the size at which Spackle works
 MAYBE_360_NOTE = "looks like a 360° panorama, whose scene would be bent: cut a flat view out of it"
+LARGEST_BY_TYPE = {"uint8": 255, "uint16": 65535}  # the number of white in an array of colours
+CHANNELS_WITH_OPACITY = 4
+CHANNEL_COUNTS = (1, 3, CHANNELS_WITH_OPACITY)  # grey, colour, colour with opacity
 REPLACED_BORDER_RATIO = 0.005  # width of the border that `replace_border` replaces, per long side
 
 
@@ -132,7 +136,7 @@ def refuse_if_not_flat(picture: OpenPicture, path: str | os.PathLike[str]) -> No
 
 
 def photo_from_picture(
-    picture: Image.Image | NDArray[Any] | Tensor,
+    picture: Any,
     *,
     keep_frame: bool = True,
     **focal_options: float | None,
@@ -140,7 +144,9 @@ def photo_from_picture(
     """Make a photo from a picture in memory.
 
     Args:
-        picture: a PIL image, or sRGB [H, W, 3] or [3, H, W] as uint8 or as floats in 0..1.
+        picture: a PIL image; or sRGB as an array or tensor [H, W, 3], [3, H, W], with a fourth
+            channel for opacity, or [H, W] for grey: uint8, uint16 (up to 65535), or floats in 0..1.
+            Further axes of length 1 are left out. Masked pixels become white, as transparent ones.
         keep_frame: keep a uniform border, such as a scan's margin.
         focal_options: at most one of `focal_px`, `focal_mm` and `fov`, as in `load_photo`.
 
@@ -158,44 +164,62 @@ def photo_from_picture(
         with as_input_error(name, "the picture cannot be used: {reason}"):
             colors = image_to_srgb(picture, read_stated_colors(picture, exif), exif, name)
     else:
-        colors = SrgbPicture(_array_to_rgb(picture, name), ())
+        colors = SrgbPicture(_array_to_rgb(plain_array(picture, name), name), ())
     return _make_photo(colors, exif, name, keep_frame, **focal_options)
 
 
-def _array_to_rgb(picture: NDArray[Any] | Tensor, name: Path) -> Tensor:
-    """Convert sRGB [H, W, 3] or [3, H, W], uint8 or floats in 0..1, to float32 [H, W, 3] in 0..1.
+def _array_to_rgb(picture: PlainArray, name: Path) -> Tensor:
+    """Convert sRGB of uint8, uint16 or floats in 0..1 to float32 [H, W, 3] in 0..1.
+
+    The shape is [H, W, C] or [C, H, W] for 1 (grey), 3 or 4 channels (the last one is opacity), or
+    [H, W]. What is transparent or masked becomes white.
 
     Raises:
-        InputError: another shape, dtype or range; `name` stands at the beginning of the message.
+        InputError: another shape, type or range; `name` stands at the beginning of the message.
     """
-    if isinstance(picture, Tensor):
-        values = picture.detach().cpu()
-    else:
-        values = torch.from_numpy(np.array(picture))
+    numbers = _channels_last(picture.numbers, name)  # [H, W, C]
+    height, width, channel_count = numbers.shape
+    check_pixel_count(width, height, file_bytes=None, path=name)
 
-    shape = tuple(values.shape)
-    has_three_channels = values.ndim == 3 and 3 in (shape[0], shape[2])
-    if not has_three_channels or values.numel() == 0:
+    largest = LARGEST_BY_TYPE.get(numbers.dtype.name)
+    if numbers.dtype.kind != "f" and largest is None:
+        raise InputError(
+            f"{name}: colours as {numbers.dtype}: give uint8, uint16, or floats from 0 to 1"
+        )
+    values = numbers.astype(np.float32) / np.float32(largest or 1)
+    if picture.known is not None:
+        is_known = _channels_last(picture.known, name).all(axis=-1)  # [H, W]
+        values[~is_known] = 1
+    is_in_range = np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1
+    if not is_in_range:
+        raise InputError(
+            f"{name}: colours from {values.min():g} to {values.max():g}: "
+            "give floats from 0 to 1, uint8 or uint16"
+        )
+
+    rgb = values if channel_count > 1 else np.repeat(values, 3, axis=-1)
+    if channel_count == CHANNELS_WITH_OPACITY:
+        opacity = values[..., 3:]
+        rgb = opacity * values[..., :3] + (1 - opacity)  # over white
+    return torch.from_numpy(np.ascontiguousarray(rgb, np.float32))
+
+
+def _channels_last(numbers: NDArray[Any], name: Path) -> NDArray[Any]:
+    """A picture as [H, W, C], from [H, W], [H, W, C] or [C, H, W] with 1, 3 or 4 channels.
+
+    Further axes of length 1 are left out. InputError for another shape.
+    """
+    shape = tuple(numbers.shape)
+    numbers = without_unit_axes(numbers, 3)
+    if numbers.ndim == 2:
+        numbers = numbers[..., None]
+    if numbers.ndim == 3 and numbers.shape[2] not in CHANNEL_COUNTS:
+        numbers = np.moveaxis(numbers, 0, 2)  # [C, H, W] to [H, W, C]
+    if numbers.ndim != 3 or numbers.shape[2] not in CHANNEL_COUNTS or not numbers.size:
         raise InputError(
             f"{name}: a picture of shape {short_repr(shape)}: give [H, W, 3] or [3, H, W]"
         )
-    if shape[2] != 3:
-        values = values.movedim(0, 2)  # [3, H, W] to [H, W, 3]
-    height, width = values.shape[:2]
-    check_pixel_count(width, height, file_bytes=None, path=name)
-
-    if values.dtype == torch.uint8:
-        return values.float() / 255
-    if not values.is_floating_point():
-        raise InputError(f"{name}: colours as {values.dtype}: give uint8, or floats from 0 to 1")
-    rgb = values.float().clone()
-    is_in_range = torch.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1
-    if not is_in_range:
-        raise InputError(
-            f"{name}: colours from {rgb.min():g} to {rgb.max():g}: "
-            "give floats from 0 to 1, or uint8"
-        )
-    return rgb
+    return numbers
 
 
 def _make_photo(

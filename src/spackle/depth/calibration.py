@@ -81,6 +81,7 @@ class Calibration:
             stored_unit=self.scale / (self.baseline_m * self.focal_px),
             K=self.K,
             path=path,
+            meaning="disparity in pixels",
         )
 
     def depth_from_positive(self, disparity_px: Array, path: StrPath) -> DepthMap:

@@ -23,6 +23,14 @@ StrPath = str | os.PathLike[str]
 Quantity = Literal["depth", "disparity"]
 
 ASPECT_TOLERANCE = 0.01  # a depth map's aspect ratio may differ from the photo's by this share
+# Networks round the sides of their input to multiples of these: patches of 14 or 16 pixels, five
+# halvings, and the factors of encoders. Their maps show the whole photo, a little stretched.
+NETWORK_SIDE_MULTIPLES = (8, 14, 16, 32, 64)
+MAX_NETWORK_STRETCH = 0.05  # share by which such a map's aspect ratio may differ from the photo's
+# Depths in metres that a map may hold. Their squares, and products with a focal length, fit
+# float32. Renderers write 1e10 for the background.
+MIN_DEPTH_M = 1e-9
+MAX_DEPTH_M = 1e12
 NEAR_AND_FAR_QUANTILES = (0.01, 0.99)  # quantiles that count as the nearest and farthest depth
 MIN_DISTINCT_VALUES = 16  # fewer distinct values may share a divisor by chance
 MAX_EXACT_INTEGER = 1 << 53  # beyond it, float64 skips integers
@@ -39,21 +47,34 @@ class DepthMap:
     quantity: Quantity  # the stored quantity
     path: Path  # the file, for messages
     note: str = ""  # for the report: the format of a depth map that was inside a photo
+    meaning: str = ""  # for the report: how the stored numbers were understood, such as "metres"
+    is_guess: bool = False  # whether nobody stated the meaning or the unit
 
     @property
     def range_in_words(self) -> str:
-        """The near (1 % quantile), median and far (99 %) depth for a report, such as "1 m near"."""
+        """The near (1 % quantile), median and far (99 %) depth, such as "near 1 m, median …"."""
         near_quantile, far_quantile = NEAR_AND_FAR_QUANTILES
         known_depths = self.depth[self.valid].numpy()
         near, median, far = np.quantile(known_depths, [near_quantile, 0.5, far_quantile])
-        return f"{near:.3g} m near, {median:.3g} m median, {far:.3g} m far"
+        return f"near {near:.3g} m, median {median:.3g} m, far {far:.3g} m"
+
+    def stretch_to(self, height: int, width: int) -> float:
+        """How much wider this map is than a height×width photo, relative: 0.02 for 2 %."""
+        # A map may be smaller or larger than its photo: only the shape counts.
+        rows, columns = self.depth.shape
+        return columns * height / (rows * width) - 1
 
     def check_aspect_ratio(self, height: int, width: int, photo: StrPath) -> None:
-        """InputError unless a height×width photo has this map's aspect ratio within 1 %."""
-        # A map may be smaller or larger than its photo: only the shape must fit.
+        """InputError unless this map has the aspect ratio of a height×width photo.
+
+        It may differ by 1 %; and by what a network's rounding of both sides explains, up to 5 %.
+        """
+        stretch = abs(self.stretch_to(height, width))
+        if stretch <= ASPECT_TOLERANCE:
+            return
         rows, columns = self.depth.shape
-        ratio_of_aspects = columns * height / (rows * width)
-        if abs(ratio_of_aspects - 1) > ASPECT_TOLERANCE:
+        is_rounded = is_size_of_network(rows, columns, height, width)
+        if not is_rounded or stretch > MAX_NETWORK_STRETCH:
             raise InputError(
                 f"depth map {self.path} is {columns}×{rows} but photo {photo} is {width}×{height}: "
                 "give a depth map with the photo's size or aspect ratio"
@@ -78,9 +99,27 @@ class DepthMap:
         return dataclasses.replace(self, depth=self.depth * factor, K=K, quantum=quantum)
 
 
+def is_size_of_network(rows: int, columns: int, height: int, width: int) -> bool:
+    """Whether rows×columns is the size to which a network may shrink a height×width photo.
+
+    That is, both sides are multiples of 8, 14, 16, 32 or 64 pixels, and one of them is at most one
+    such step away from the side that the photo's aspect ratio asks for.
+    """
+    # The sides that would keep the aspect ratio, if the other side is right.
+    exact_rows = columns * height / width
+    exact_columns = rows * width / height
+    for multiple in NETWORK_SIDE_MULTIPLES:
+        are_multiples = rows % multiple == 0 and columns % multiple == 0
+        smaller_error = min(abs(rows - exact_rows), abs(columns - exact_columns))
+        if are_multiples and smaller_error <= multiple:
+            return True
+    return False
+
+
 def is_valid_depth(metres: Tensor) -> Tensor:
-    """Mask of valid depths: positive and finite, with a finite inverse."""
-    return torch.isfinite(metres) & (metres > 0) & torch.isfinite(1 / metres)
+    """Mask of valid depths: from a nanometre to 1e12 m, between which all arithmetic is safe."""
+    # Comparisons are false for NaN.
+    return (metres >= MIN_DEPTH_M) & (metres <= MAX_DEPTH_M)
 
 
 def quantisation_step(values: Array) -> float | None:
@@ -122,10 +161,12 @@ def build_depth_map(
     stored_unit: float | None,
     K: Tensor | None,
     path: StrPath,
+    meaning: str,
+    is_guess: bool = False,
 ) -> DepthMap:
     """The depth map of a file's numbers that were converted to metres.
 
-    Depths that are 0, or that float32 cannot hold or invert, become unknown.
+    Depths that are 0, or beyond MIN_DEPTH_M to MAX_DEPTH_M, become unknown.
 
     Args:
         stored: [H, W] the file's numbers, whose common step becomes the quantisation step.
@@ -136,6 +177,8 @@ def build_depth_map(
             numbers are floats, which have no common step.
         K: [3, 3] intrinsics of the map, None if they are not known.
         path: the file, for messages.
+        meaning: how `stored` was understood, such as "metres".
+        is_guess: whether nobody stated that meaning.
 
     Raises:
         InputError: no pixel is known.
@@ -144,6 +187,12 @@ def build_depth_map(
         metres = torch.from_numpy(depth.astype(np.float32))
     known = torch.from_numpy(valid) & is_valid_depth(metres)
     if not known.any():
+        positive = depth[valid & np.isfinite(depth) & (depth > 0)]
+        if positive.size:
+            raise InputError(
+                f"{path}: read as {meaning}, its depth goes from {positive.min():.3g} to "
+                f"{positive.max():.3g} m, which nothing in a photo has: give `depth_unit`"
+            )
         raise InputError(f"{path}: all-invalid: not one of {stored.size} pixels has a {quantity}")
 
     # The step is kept, because smoothing must know it: a step of the numbers is no edge of a
@@ -159,4 +208,6 @@ def build_depth_map(
         quantum=quantum,
         quantity=quantity,
         path=Path(path),
+        meaning=meaning,
+        is_guess=is_guess,
     )

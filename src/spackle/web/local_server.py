@@ -91,13 +91,14 @@ def show_page(
     # so cannot use the base "rgbd", which needs one.
     base_name = AUTO if options.base.name == RGBD else options.base.name
     base_of_sent_photos = dataclasses.replace(
-        options.base, name=base_name, depth=None, depth_kind="auto"
+        options.base, name=base_name, depth=None, depth_kind="auto", depth_unit=None
     )
     base_of_sent_photos.check()
     default_options = {
         "disparity": options.disparity,
         "keep_frame": options.keep_frame,
         "depth_kind": options.base.depth_kind,
+        "depth_unit": options.base.depth_unit,
     }
     work = SceneWork(base_of_sent_photos, default_options, reporter.verbose)
 

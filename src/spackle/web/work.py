@@ -71,6 +71,11 @@ class SceneOptions(BaseModel):
         None, max_length=80, description="One of the server's bases; null: its default."
     )
     depth_kind: DepthKind = Field("auto", description="What the numbers in the depth map mean.")
+    depth_unit: str | None = Field(
+        None,
+        max_length=40,
+        description="Unit of metric depth, such as m, mm or 1/256; null: mm in a PNG, else m.",
+    )
     disparity: float | None = Field(
         None, ge=0, le=MAX_DISPARITY, description="How far the camera moves; 0.3 is large."
     )
@@ -213,6 +218,7 @@ class SceneWork:
                 checkpoint=None,
                 depth=job.folder / job.depth,
                 depth_kind=options.depth_kind,
+                depth_unit=options.depth_unit,
             )
         if options.base is not None and options.base != self.base.name:
             return dataclasses.replace(self.base, name=options.base, checkpoint=None)

@@ -20,8 +20,6 @@ from spackle.depth.readers import load_depth
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import list_files
 
-LOADED_UNIT_M = 0.001  # `load_depth` takes whole numbers for millimetres
-
 
 @dataclasses.dataclass(frozen=True)
 class StereoPair:
@@ -107,11 +105,9 @@ def load_frame(color_file: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
     rgb = load_photo(color_file).rgb
     # The names of a frame's files differ by one word and the suffix.
     depth_name = color_file.name.replace(".color.", ".depth.")
-    depth = load_depth(color_file.with_name(depth_name).with_suffix(".png"))
+    depth = load_depth(color_file.with_name(depth_name).with_suffix(".png"), unit=unit_m)
     depth.check_aspect_ratio(rgb.shape[0], rgb.shape[1], color_file)
-    # `load_depth` has taken one unit of the file for a millimetre; this camera's unit may differ.
-    depth_m = depth.depth * (unit_m / LOADED_UNIT_M)
-    return rgb, dataclasses.replace(depth, depth=depth_m)
+    return rgb, depth
 
 
 def load_pair(folder: Path) -> StereoPair:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from spackle.core.image_formats import list_photos
 from spackle.depth.calibration import Calibration, read_short_text
 from spackle.depth.depth_map import DepthMap
-from spackle.depth.readers import read_array
+from spackle.depth.readers import read_stored_depth
 from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.datasets.dataset import EvalDataset
 from spackle.paper.evaluation.datasets.stereo import (
@@ -65,8 +65,7 @@ def _cases_of_scene(folder: Path) -> list[Case]:
 
     def read_depth() -> DepthMap:
         """Depth of the left photos."""
-        # `read_array` also returns whether the file is a PNG.
-        disparity, _ = read_array(disparity_path)
+        disparity = read_stored_depth(disparity_path).numbers
         return calibration.depth_from_positive(disparity, disparity_path)
 
     cases = []

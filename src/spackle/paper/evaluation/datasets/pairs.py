@@ -23,7 +23,7 @@ from spackle.core.camera import Camera
 from spackle.core.image_files import upright_size
 from spackle.depth.calibration import Calibration, read_short_text
 from spackle.depth.depth_map import DepthMap
-from spackle.depth.readers import load_depth, read_array
+from spackle.depth.readers import load_depth, read_stored_depth
 from spackle.formats.camera_files import Number, Row3, Row4, SidePx, checked_camera
 from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.datasets.dataset import DatasetDescription, EvalDataset
@@ -210,8 +210,8 @@ def _rectified_case(folder: Path, pair: _RectifiedPair) -> Case:
 
 def _read_disparity(path: Path, calibration: Calibration) -> DepthMap:
     """The depth of the left photo, from its map of disparities."""
-    stored, is_png = read_array(path)
-    return calibration.depth_from_disparity(stored, path, zero_is_unknown=is_png)
+    stored = read_stored_depth(path)
+    return calibration.depth_from_disparity(stored.numbers, path, zero_is_unknown=stored.is_picture)
 
 
 # --- posed photos
