@@ -42,7 +42,7 @@ from spackle.render import CpuRenderer
 from spackle.render.drawing import project, tiles_to_draw
 from spackle.render.gsplat_backend import DeviceGaussians, GsplatRenderer, load_gsplat
 from spackle.render.project import KernelCamera
-from spackle.render.protocol import NEAR_PLANE, TILE_PX, Rendering
+from spackle.render.protocol import TILE_PX, Rendering, near_plane
 from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import shipped_network
 from spackle.runtime.device import Precision, hardware_facts, package_versions
@@ -164,6 +164,7 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
     for camera in cameras:
         one, other = gpu.render(scene, camera), CpuRenderer().render(scene, camera)
         apart = (one.rgb - other.rgb).abs().amax(-1)
+        near = near_plane([scene], camera)
         material, view = DeviceGaussians.of(scene, CUDA), camera.to(CUDA)
         radii = gpu._gsplat.fully_fused_projection(
             material.means,
@@ -175,11 +176,11 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
             camera.width,
             camera.height,
             eps2d=0.0,
-            near_plane=NEAR_PLANE,
+            near_plane=near,
             opacities=material.opacities,
         )[0][0]
         here = (radii > 0).all(-1).cpu()
-        lens = KernelCamera.of(camera, 0.0)
+        lens = KernelCamera.of(camera, 0.0, near)
         there = torch.from_numpy(
             project([scene], lens, tiles_to_draw(lens, None))[0].boxes[: len(scene), 1] > 0
         )

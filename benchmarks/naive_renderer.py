@@ -19,7 +19,13 @@ from spackle.paper.evaluation.bench import EndStage
 from spackle.render.covariance import projected_covariance
 from spackle.render.drawing import GAUSSIANS_PER_CHUNK, TILES_PER_CHUNK
 from spackle.render.project import KernelCamera
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE_PX, TRANSMITTANCE_STOP
+from spackle.render.protocol import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    TILE_PX,
+    TRANSMITTANCE_STOP,
+    near_plane,
+)
 from spackle.runtime.device import parallel_for_chunks
 
 Array = npt.NDArray[Any]
@@ -30,7 +36,8 @@ def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: 
     """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in
     ours.
     """
-    tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
+    tensors = tuple(t.numpy() for t in scene.tensors)
+    view = KernelCamera.of(camera, 0.0, near_plane([scene], camera))
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
     parallel_for_chunks(
         lambda a, b: naive_project(a, b, tensors, view, splats, boxes),
@@ -69,7 +76,7 @@ def naive_project(
             + pose[:, 3]
         )
         splats[i, 2] = z
-        if z < NEAR_PLANE or opacities[i] < ALPHA_MIN:
+        if z < view.near or opacities[i] < ALPHA_MIN:
             continue
         xx, xy, yy, det = projected_covariance(
             x / z, y / z, 1 / z, quats[i], scales[i], lens, pose, view.eps2d

@@ -62,6 +62,7 @@ from spackle.render.drawing import (
     tiles_to_draw,
 )
 from spackle.render.project import KernelCamera
+from spackle.render.protocol import near_plane
 from spackle.render.tile_lists import list_tiles, sort_tiles
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
@@ -155,7 +156,7 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
 
 def render_in_laps(scene: Gaussians, camera: Camera, lap: EndStage) -> None:
     """Do what `spackle.render.drawing.draw` does, with a lap after each step."""
-    view = KernelCamera.of(camera, 0.0)
+    view = KernelCamera.of(camera, 0.0, near_plane([scene], camera))
     wanted = tiles_to_draw(view, None)
     splats = project([scene], view, wanted)
     lap("project")

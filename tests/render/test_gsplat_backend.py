@@ -55,6 +55,15 @@ def agree(one: Rendering, other: Rendering) -> None:
     torch.testing.assert_close(one.depth[same], other.depth[same], rtol=2e-3, atol=0)
 
 
+@pytest.mark.parametrize("size", [1e-3, 1e3])
+def test_a_scene_in_another_unit_gives_the_same_picture(gpu: GsplatRenderer, size: float) -> None:
+    scaled = dataclasses.replace(BASE, means=BASE.means * size, scales=BASE.scales * size)
+    expected = gpu.render(BASE, SCENE.camera)
+    view = gpu.render(scaled, SCENE.camera)
+    agree(view, dataclasses.replace(expected, depth=expected.depth * size))
+    assert bool(view.alpha.mean() > 0.9)
+
+
 def test_images_match_the_cpu_renderer(gpu: GsplatRenderer) -> None:
     for camera in (SCENE.camera, SIDE):
         for eps2d in (0.0, 0.3):

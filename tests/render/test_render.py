@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -18,7 +18,14 @@ from spackle.core.gaussians import Gaussians
 from spackle.render import TILE_PX, CpuRenderer, get_renderer, touched_tiles
 from spackle.render.fast_math import decode_srgb, encode_srgb, exp2, natural_log
 from spackle.render.project import BLOCK_GAUSSIANS
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP, Rendering
+from spackle.render.protocol import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    NEAR_PLANE_RATIO,
+    TRANSMITTANCE_STOP,
+    Rendering,
+    near_plane,
+)
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
 from spackle.runtime.errors import InputError
 
@@ -123,10 +130,53 @@ def test_blending_stops_before_a_pixel_is_full(renderer):
 @BOTH
 def test_gaussians_before_the_near_plane_are_skipped(renderer):
     empty = Gaussians.empty()
-    for drawn in (ball(z=-2.0), ball(z=0.0), ball(z=0.009), empty, [], [empty, empty]):
+    for drawn in (ball(z=-2.0), ball(z=0.0), ball(z=math.nan), empty, [], [empty, empty]):
         view = renderer.render(drawn, CAMERA)
         assert view.rgb.shape == (33, 33, 3)
         assert not any(image.any() for image in view.tensors)
+
+    # The near plane is 1e-4 of the depth of the scene, here of 200 balls that are out of view.
+    scene = [ball(x=90.0, z=2.0, sigma=1e-3)] * 200
+    for size in (1e-6, 1.0, 1e6):
+        for z, is_drawn in ((1.9e-4, False), (2.1e-4, True)):
+            near = scaled(Gaussians.cat([*scene, ball(z=z, sigma=4e-6)]), size)
+            assert bool(renderer.render(near, CAMERA).alpha.any()) == is_drawn
+
+
+def scaled(gaussians: Gaussians, size: float) -> Gaussians:
+    """The scene in another unit of length: 1000 for millimetres if it was in metres."""
+    return dataclasses.replace(
+        gaussians, means=gaussians.means * size, scales=gaussians.scales * size
+    )
+
+
+@BOTH
+@pytest.mark.parametrize("size", [2.0**-20, 2.0**-10, 2.0**10, 2.0**20])
+def test_a_scene_in_another_unit_gives_the_same_picture_bit_by_bit(renderer, size):
+    scene = random_scene(4, 200, CAMERA)
+    moved = turned_camera(50, 40, 45.0)
+    for camera in (CAMERA, moved):
+        pose = camera.world_to_camera.clone()
+        pose[:3, 3] *= size
+        view = renderer.render(scene, camera)
+        other = renderer.render(
+            scaled(scene, size), dataclasses.replace(camera, world_to_camera=pose)
+        )
+        assert view.alpha.any()
+        assert torch.equal(other.rgb, view.rgb)
+        assert torch.equal(other.alpha, view.alpha)
+        assert torch.equal(other.depth, view.depth * size)
+
+
+def test_the_near_plane_comes_from_all_sets_as_if_they_were_one():
+    scene = random_scene(5, 9000, CAMERA)
+    whole = near_plane([scene], CAMERA)
+    for cuts in ([3000], [1, 2, 8999], [0, 4500]):
+        edges = [0, *cuts, 9000]
+        parts = [scene.select(slice(a, b)) for a, b in pairwise(edges)]
+        assert near_plane(parts, CAMERA) == whole
+    z = scene.means[:, 2][scene.means[:, 2] > 0]
+    assert whole == pytest.approx(NEAR_PLANE_RATIO * float(z.quantile(0.01)), rel=0.2)
 
 
 @BOTH

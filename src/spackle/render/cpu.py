@@ -12,7 +12,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.render.drawing import draw, tiles_to_draw
 from spackle.render.gradients import draw_with_gradients
 from spackle.render.project import KernelCamera
-from spackle.render.protocol import Renderer, Rendering, as_sets
+from spackle.render.protocol import Renderer, Rendering, as_sets, near_plane
 
 
 class CpuRenderer(Renderer):
@@ -40,7 +40,7 @@ class CpuRenderer(Renderer):
             previous_rendering: where all other tiles are copied from; None: they are black.
         """
         sets = as_sets(gaussians)
-        view = KernelCamera.of(camera, eps2d)
+        view = KernelCamera.of(camera, eps2d, near_plane(sets, camera))
         drawn_tiles = tiles_to_draw(view, tiles)
 
         # If all tiles are drawn, nothing is left of a previous rendering, not even a gradient.

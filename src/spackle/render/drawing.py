@@ -20,7 +20,7 @@ from spackle.render.project import (
     count_drawn_tiles,
     project_gaussians,
 )
-from spackle.render.protocol import Rendering, as_sets, check_tiles
+from spackle.render.protocol import MIN_NEAR_PLANE, Rendering, as_sets, check_tiles
 from spackle.render.tile_lists import TileLists, list_tiles, sort_tiles
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import Array
@@ -99,7 +99,8 @@ def blank_images(view: KernelCamera, background: Rendering | None, keep_linear: 
 
 def touched_tiles(gaussians: Gaussians | Sequence[Gaussians], camera: Camera) -> Tensor:
     """[ceil(H/16), ceil(W/16)] bool: tiles with pixels that these Gaussians can change."""
-    view = KernelCamera.of(camera, eps2d=0.0)
+    # Drawn together with others, they may have a nearer near plane than alone.
+    view = KernelCamera.of(camera, eps2d=0.0, near=MIN_NEAR_PLANE)
     _, lists = project_and_list(as_sets(gaussians), view, tiles_to_draw(view, None))
     list_lengths = np.diff(lists.starts)
     return torch.from_numpy(list_lengths > 0).reshape(view.tiles)

@@ -15,13 +15,13 @@ from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.render.project import MAX_FINITE
 from spackle.render.protocol import (
-    NEAR_PLANE,
     TILE_PX,
     Renderer,
     Rendering,
     as_sets,
     check_tiles,
     common_size,
+    near_plane,
     paste,
     tile_grid,
 )
@@ -304,6 +304,7 @@ class GsplatRenderer(Renderer):
         extrinsics, intrinsics = self._upload_cameras(cameras)
         parts: list[ProjectedBatch] = []
         for view, sets in enumerate(scenes):
+            near = near_plane(sets, cameras[view])
             for gaussians in sets:
                 if not len(gaussians):  # gsplat 1.5.3 divides by the number of Gaussians
                     continue
@@ -313,7 +314,7 @@ class GsplatRenderer(Renderer):
                 radii, centers, depths, conics, _ = self._gsplat.fully_fused_projection(
                     uploaded.means, uploaded.covariances, None, None,
                     extrinsics[view], intrinsics[view], width, height,
-                    eps2d=eps2d, near_plane=NEAR_PLANE, far_plane=MAX_FINITE,
+                    eps2d=eps2d, near_plane=near, far_plane=MAX_FINITE,
                     opacities=uploaded.opacities,
                 )  # fmt: skip
                 parts.append(

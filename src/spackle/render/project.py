@@ -14,7 +14,7 @@ import numpy as np
 from spackle.core.camera import Camera
 from spackle.render.covariance import CX, CY, FX, FY, Numbers, projected_covariance
 from spackle.render.fast_math import natural_log
-from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE_PX, tile_grid
+from spackle.render.protocol import ALPHA_MIN, TILE_PX, tile_grid
 from spackle.runtime.kernels import HALF, ZERO, Array, inlined_kernel, kernel
 
 Arrays = tuple[Array, ...]
@@ -49,10 +49,14 @@ class KernelCamera(NamedTuple):
     width: int  # pixels
     height: int
     eps2d: float  # added to the diagonal of each projected covariance, in pixels²
+    near: float  # Gaussians of smaller depth z are not drawn
 
     @staticmethod
-    def of(camera: Camera, eps2d: float) -> KernelCamera:
-        """Read a camera's matrices, and compute the bounds of x/z and y/z for the Jacobian."""
+    def of(camera: Camera, eps2d: float, near: float) -> KernelCamera:
+        """Read a camera's matrices, and compute the bounds of x/z and y/z for the Jacobian.
+
+        `near` is the depth of the near plane.
+        """
         K = camera.K.detach().double().cpu().numpy()
         pose = np.ascontiguousarray(camera.world_to_camera.detach().double().cpu().numpy()[:3])
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -65,7 +69,7 @@ class KernelCamera(NamedTuple):
         top = -cy / fy - slack_y
         bottom = (camera.height - cy) / fy + slack_y
         lens = np.array([fx, fy, cx, cy, left, right, top, bottom])
-        return KernelCamera(lens, pose, camera.width, camera.height, float(eps2d))
+        return KernelCamera(lens, pose, camera.width, camera.height, float(eps2d), near)
 
     @property
     def tiles(self) -> tuple[int, int]:
@@ -215,7 +219,7 @@ def project_block(
         top, bottom = pixel_range(v, half_height, camera.height)
 
         # An ellipse without area is invisible. All comparisons are false for NaN.
-        drawable = (z >= NEAR_PLANE) & (z < MAX_FINITE)
+        drawable = (z >= camera.near) & (z < MAX_FINITE)
         drawable &= (opacity >= ALPHA_MIN) & (opacity < MAX_FINITE)
         drawable &= (det > 0.0) & (det < MAX_FINITE) & (cxx < MAX_FINITE) & (cyy < MAX_FINITE)
         drawable &= (across < MAX_FINITE) & (fall < MAX_FINITE)

@@ -20,7 +20,13 @@ from spackle.core.gaussians import Gaussians
 ALPHA_MAX = 0.999  # largest alpha of a Gaussian in a pixel, as in gsplat 1.5
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian is skipped where its alpha is smaller
 TRANSMITTANCE_STOP = 1e-4  # a pixel is full once its transmittance would fall to this
-NEAR_PLANE = 0.01  # nearer Gaussians are not drawn
+# The near plane, in front of which nothing is drawn, as a fraction of the depth within which the
+# nearest 1 % of a view's Gaussians lie. It only keeps projections finite: with a rare thing 1 m
+# away before mountains 9 km away, it must still be nearer than both.
+NEAR_PLANE_RATIO = 1e-4
+NEAR_PLANE_QUANTILE = 0.01
+NEAR_PLANE_SAMPLES = 4096  # Gaussians from which this depth is estimated
+MIN_NEAR_PLANE = 1e-30  # in the scene's unit; the inverse of a depth beyond it is finite
 TILE_PX = 16  # pixels along a tile's side
 
 
@@ -109,6 +115,34 @@ class Renderer(Protocol):
             )
             for sets, camera, view_tiles, previous_rendering in views
         ]
+
+
+@torch.no_grad()
+def near_plane(sets: Sequence[Gaussians], camera: Camera) -> float:
+    """The depth z of a view's near plane, in front of which Gaussians are not drawn.
+
+    It is proportional to the depth of the scene, so that a scene in another unit of length looks
+    the same. `sets` are all Gaussians of the view.
+    """
+    # Every n-th Gaussian of all sets, as if they were one.
+    count = sum(len(part) for part in sets)
+    step = max(1, math.ceil(count / NEAR_PLANE_SAMPLES))
+    samples = []
+    first_index = 0  # in the set, of its first Gaussian that is sampled
+    for part in sets:
+        if first_index < len(part):
+            samples.append(part.means[first_index::step].to("cpu", torch.float64))
+        first_index = (first_index - len(part)) % step
+    if not samples:
+        return MIN_NEAR_PLANE
+
+    z = camera.to("cpu", torch.float64).to_camera(torch.cat(samples))[:, 2]
+    in_front = z[(z > 0) & z.isfinite()]
+    if not len(in_front):
+        return MIN_NEAR_PLANE
+    rank = int(NEAR_PLANE_QUANTILE * (len(in_front) - 1))  # from 0
+    depth = float(in_front.kthvalue(rank + 1).values)
+    return max(MIN_NEAR_PLANE, NEAR_PLANE_RATIO * depth)
 
 
 def as_sets(gaussians: Gaussians | Sequence[Gaussians]) -> list[Gaussians]:

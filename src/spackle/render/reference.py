@@ -13,10 +13,10 @@ from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.render.protocol import (
     ALPHA_MAX,
     ALPHA_MIN,
-    NEAR_PLANE,
     TRANSMITTANCE_STOP,
     Renderer,
     Rendering,
+    near_plane,
     paste,
 )
 
@@ -68,7 +68,7 @@ def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
         finite_by_field.append(is_finite)
     finite = torch.stack(finite_by_field).all(dim=0)
     z = camera.to_camera(gaussians.means.detach())[:, 2]
-    drawable = gaussians.select(finite & (z >= NEAR_PLANE))
+    drawable = gaussians.select(finite & (z >= near_plane([gaussians], camera)))
 
     # Stable: Gaussians of equal depth keep their order, as in the fast renderers.
     z = camera.to_camera(drawable.means.detach())[:, 2]
