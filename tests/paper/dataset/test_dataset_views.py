@@ -24,7 +24,7 @@ from spackle.render import get_renderer
 
 
 @pytest.mark.parametrize("kind", SHARP_TRAJECTORIES)
-@pytest.mark.parametrize("views", [2, 20])
+@pytest.mark.parametrize("views", [2, 10, 20, 22])
 def test_no_two_views_are_alike_and_the_first_is_the_photos(
     kind: SharpTrajectory, views: int
 ) -> None:

@@ -34,7 +34,7 @@ from spackle.scene_fill.fill import farthest_first
 
 # Two views are the same if their cameras are closer than this times the path's greatest offset.
 SAME_VIEW_DISTANCE = 1e-3
-MAX_EXTRA_FRAMES = 6  # of a path, tried because frames may coincide
+MAX_EXTRA_FRAMES = 8  # of a path, tried because frames may coincide; `shake` needs 8 for 10 views
 SAME_SURFACE_TOLERANCE = 0.03  # two depths with less relative difference belong to one surface
 MIN_INVERSE_DEPTH = 1e-6  # the smallest inverse depth to divide by
 # How holes may be completed, the values of the option `inpainter`: painted by an inpainter, filled
