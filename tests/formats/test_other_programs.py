@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import gzip
+import io
 import json
 import math
 import re
@@ -31,7 +32,9 @@ from helpers.foreign_scenes import (
     spz_gltf,
     zipped,
 )
+from helpers.plain_scenes import zstd
 from helpers.scenes import random_gaussians
+from PIL import Image
 
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
@@ -425,7 +428,32 @@ def test_a_sound_file_that_is_not_read_is_never_called_damaged(name: str, tmp_pa
     assert re.search("save|give|convert|unpack|export|put|not a Gaussian scene", message)
 
 
+def zip_bomb(version: int) -> bytes:
+    """An SPZ file of a few kilobytes that claims five million Gaussians."""
+    count = 5_000_000
+    head = struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, 5 if version == 4 else 0)
+    if version == 3:
+        return gzip.compress(head + bytes(20 * 1000))
+    parts = [bytes(count * width) for width in (9, 1, 3, 3, 4)]
+    frames = [zstd.compress(part) for part in parts]
+    sizes = zip(frames, parts, strict=True)
+    table = b"".join(struct.pack("<QQ", len(frame), len(part)) for frame, part in sizes)
+    return head + struct.pack("<I12x", 32) + table + b"".join(frames)
+
+
+def image_bomb() -> bytes:
+    """A SOG scene of some kilobytes with an image of 64 million pixels."""
+    files = sog(GAUSSIANS, 2)
+    stream = io.BytesIO()
+    Image.new("RGBA", (8000, 8000)).save(stream, "WEBP", lossless=True)
+    files["means_l.webp"] = stream.getvalue()
+    return zipped(files)
+
+
 DAMAGED = {
+    "SPZ 4, a bomb": ("a.spz", zip_bomb(4)),
+    "SPZ 3, a bomb": ("a.spz", zip_bomb(3)),
+    "SOG, a bomb": ("a.sog", image_bomb()),
     "SPZ 4, cut off": ("a.spz", spz(GAUSSIANS, 4)[:-40]),
     "SPZ 4, head only": ("a.spz", spz(GAUSSIANS, 4)[:20]),
     "SPZ 3, cut off": ("a.spz", spz(GAUSSIANS, 3)[:-40]),

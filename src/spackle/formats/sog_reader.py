@@ -32,6 +32,11 @@ from spackle.runtime.errors import short_repr
 
 MAX_MEMBER_BYTES = 1 << 28  # of a file that is read
 
+# A small file that claims a huge image would fill the memory. An image of at most so many pixels is
+# harmless; a larger one has some bytes for its pixels, unless it is uniform.
+HARMLESS_PIXELS = 1 << 22
+MAX_PIXELS_PER_BYTE = 64
+
 # A description with so many harmonics has this degree.
 DEGREE_OF_HARMONICS = {3: 1, 8: 2, 15: 3}
 
@@ -197,9 +202,11 @@ def _read_images(read_member: ReadMember, names: list[str], count: int) -> list[
     """
     images = []
     for name in names:
-        content = io.BytesIO(read_member(name))
-        with open_image(content, ("WEBP", "PNG")) as image:
+        content = read_member(name)
+        with open_image(io.BytesIO(content), ("WEBP", "PNG")) as image:
             pixel_count = image.width * image.height
+            if pixel_count > max(HARMLESS_PIXELS, MAX_PIXELS_PER_BYTE * len(content)):
+                raise ValueError(f"{name} claims {pixel_count:,} pixels in {len(content):,} bytes")
             if max(image.size) > MAX_IMAGE_SIDE_PX or not 0 < count <= pixel_count:
                 size = f"{image.width}×{image.height}"
                 raise ValueError(f"{name} has {size} pixels for {count:,} Gaussians")

@@ -34,6 +34,10 @@ EXTENSION_RECORD = struct.Struct("<II")  # kind and bytes of an extension, which
 MAX_COUNT = 10_000_000  # most Gaussians that older readers of the format accept
 MAX_HARMONICS_DEGREE = 4
 
+# As Niantic's library assumes, a file may hold at most so many Gaussians for each of its bytes: a
+# position alone has 9 bytes, which may be compressed to 1/1024.
+MAX_GAUSSIANS_PER_BYTE = 1024 / 9
+
 HAS_EXTENSIONS = 2  # this bit of the flags says that there are extensions
 COORDINATE_SYSTEM = 0xADBE0003  # kind of the extension that names the axes of the file
 MAX_EXTENSION_BYTES = 1 << 16  # of all extensions of a file, more than those that are known need
@@ -128,7 +132,7 @@ def _unpack_gzip(data: bytes) -> SpzParts:
     header = SpzHeader(*HEADER.unpack(head))
     if header.version in KNOWN_VERSIONS and header.version >= FRAMES_VERSION:
         raise ValueError(f"version {header.version} within gzip")
-    _check_header(header)
+    _check_header(header, len(data))
 
     widths = part_widths(header.version)
     body_bytes = header.gaussian_count * sum(widths)
@@ -155,7 +159,7 @@ def _unpack_gzip(data: bytes) -> SpzParts:
 def _unpack_frames(data: bytes) -> SpzParts:
     """Decompress a file of version 4, with a Zstandard frame for each attribute."""
     header = SpzHeader(*HEADER.unpack_from(data))
-    _check_header(header)
+    _check_header(header, len(data))
     (table_start,) = HEADER_END.unpack_from(data, HEADER.size)
 
     widths = part_widths(header.version)
@@ -209,8 +213,13 @@ def part_widths(version: int) -> tuple[int, int, int, int, int]:
     return position_bytes, 1, 3, 3, rotation_bytes
 
 
-def _check_header(header: SpzHeader) -> None:
-    """Raise an UnsupportedSceneError for a version, degree or size that is not read."""
+def _check_header(header: SpzHeader, file_bytes: int) -> None:
+    """Refuse a version, degree or size that is not read.
+
+    Raises:
+        UnsupportedSceneError: another program may read the file.
+        ValueError: the file of `file_bytes` bytes cannot hold so many Gaussians.
+    """
     if header.version not in KNOWN_VERSIONS:
         problem = f"SPZ version {header.version} (versions 1 to {KNOWN_VERSIONS[-1]} are read)"
         raise UnsupportedSceneError(f"{problem}: save it as version 4 or 3, or as PLY")
@@ -221,6 +230,8 @@ def _check_header(header: SpzHeader) -> None:
     if header.gaussian_count > MAX_COUNT:
         problem = f"{header.gaussian_count:,} Gaussians ({MAX_COUNT:,} at most)"
         raise UnsupportedSceneError(f"{problem}: split the scene, or save it as PLY")
+    if header.gaussian_count > MAX_GAUSSIANS_PER_BYTE * file_bytes:
+        raise ValueError(f"{header.gaussian_count:,} Gaussians in {file_bytes:,} bytes")
 
 
 def _named_parts(header: SpzHeader, parts: Sequence[NDArray[np.uint8]]) -> SpzParts:
