@@ -1,6 +1,9 @@
 """A base of your own: any class with a name that turns a photo into Gaussians.
 
 python examples/04_own_base.py photo.jpg out
+
+On the command line, in the folder of this file: `--base 04_own_base:Street`, for `spackle predict`,
+`dataset build`, `evaluate` and `bench`.
 """
 
 import sys

@@ -1,10 +1,15 @@
 """Your own inpainter paints the widest views, and the painted colours become Gaussians.
 
-python examples/06_own_inpainter.py photo.jpg out
+python examples/06_own_inpainter.py photo.jpg out.mp4
+
+On the command line, in the folder of this file, and in training data and evaluations:
+
+spackle predict photo.jpg --fill 06_own_inpainter:MeanColor
+spackle dataset build photos -o data --base lite --inpainter 06_own_inpainter:MeanColor
+spackle evaluate pairs --dataset pairs --methods inpaint2d --inpainter 06_own_inpainter:MeanColor
 """
 
 import sys
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -12,7 +17,6 @@ from torch import Tensor
 
 import spackle
 from spackle.inpaint.plain import PlainInpainter
-from spackle.scene_fill.texture import painted_texture
 
 
 class MeanColor(PlainInpainter):
@@ -25,15 +29,11 @@ class MeanColor(PlainInpainter):
         return torch.where(hole[..., None], rgb[~hole].mean(dim=0), rgb)
 
 
-def main(photo: Path, out: Path) -> None:
-    prediction = spackle.LiteBase.load().predict(spackle.load_photo(photo))
-    scene = spackle.Scene(
-        prediction.gaussians, prediction.gaussians.select(slice(0)), prediction.camera
+def main(photo: Path, video: Path) -> None:
+    scene = spackle.predict(
+        photo, base="lite", fill=f"{__name__}:MeanColor", trajectory="swipe", disparity=0.15
     )
-    texture = partial(painted_texture, MeanColor())
-    context = spackle.FillContext(scene.base, scene.camera, spackle.get_renderer(), texture=texture)
-    filled = spackle.fill_scene(context, scene.path("swipe", disparity=0.15))
-    spackle.Scene(scene.base, filled.aux, scene.camera, disparity=0.15).save_video(out, "swipe")
+    scene.save_video(video, "swipe")
 
 
 if __name__ == "__main__":

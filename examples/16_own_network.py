@@ -2,8 +2,12 @@
 
 python examples/16_own_network.py photo.jpg out.mp4
 
-To train it, put the class into a module of yours, and give its name to a recipe:
-spackle train --recipe cpu -o run network=my_package.my_module:SmallNet
+To train and use it on the command line, in the folder of this file:
+
+spackle train --recipe quick -o run data.photos=photos network=16_own_network:SmallNet
+spackle predict photo.jpg --residual run/best.safetensors --residual-network 16_own_network:SmallNet
+
+`spackle evaluate` and `spackle bench` take the same two options.
 """
 
 import sys
@@ -21,7 +25,6 @@ class SmallNet(ResidualNet):
     pixels.
     """
 
-    name = "my_package.my_module:SmallNet"
     inputs = ("rgb", "alpha", "mask", "initial")  # 3 + 1 + 1 + 4 channels
     local = False
 

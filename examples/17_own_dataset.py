@@ -9,7 +9,6 @@ the right. On the command line, in the folder of this file:
 spackle evaluate pairs --dataset 17_own_dataset:OWN_PAIRS --protocol near-view --base rgbd
 """
 
-import dataclasses
 import functools
 import json
 import sys
@@ -35,7 +34,7 @@ def read_cases(scenes: Mapping[str, Path]) -> list[Case]:
         camera = spackle.Camera.from_focal(numbers["focal_px"], numbers["width"], numbers["height"])
         to_second = torch.eye(4)
         to_second[0, 3] = -numbers["right_m"]
-        second_camera = dataclasses.replace(camera, world_to_camera=to_second)
+        second_camera = spackle.Camera(camera.K, to_second, camera.width, camera.height)
         second = SecondView("right", folder / "second.png", second_camera)
         read_depth = functools.partial(spackle.load_depth, folder / "depth.npy")
         cases.append(Case(name, folder / "photo.png", camera, read_depth, second_views=(second,)))
@@ -53,14 +52,9 @@ OWN_PAIRS = EvalDataset(
 
 
 def main(pairs: Path, results: Path) -> None:
-    options = EvaluateOptions(
-        dataset=f"{__name__}:OWN_PAIRS",
-        root=pairs,
-        protocol="near-view",
-        methods=("base", "spackle"),
-        metrics=("psnr", "ssim"),
-        base=BaseSettings(name="rgbd"),
-    )
+    name = f"{__name__}:OWN_PAIRS"
+    base = BaseSettings(name="rgbd")
+    options = EvaluateOptions(dataset=name, root=pairs, protocol="near-view", base=base)
     evaluate(options, results, Reporter())
 
 

@@ -37,6 +37,7 @@ JOURNEYS = (
     "scene_fill/test_fill_scene.py",
     "test_api.py",
     "test_examples.py",
+    "test_extensions.py",
     "test_quick_start.py",
     "web",
 )

@@ -26,7 +26,7 @@ from spackle.core.trajectories import TrajectoryKind
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.readers import DepthValue
 from spackle.depth.units import DepthKind
-from spackle.pipeline import FillMode, FillOptions, FillTexture, Pipeline, PipelineOptions
+from spackle.pipeline import FillMode, FillOptions, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError, short_repr, shorten_input_errors
@@ -58,7 +58,7 @@ class Spackle:
         base: str | Base = AUTO,
         *,
         residual: Residual = None,
-        fill: FillTexture = "auto",
+        fill: str = "auto",
         mode: FillMode = "scene",
         device: str = "auto",
         renderer: Renderer | None = None,
@@ -74,7 +74,7 @@ class Spackle:
                 fill without a network, or "none" to keep the holes; None takes the weights that
                 come with Spackle.
             fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none"
-                keeps the holes.
+                keeps the holes; `package.module:Class` is an inpainter of another package.
             mode: "scene" fills the holes of all views by one set of Gaussians; "view" fills each
                 view by a set of its own; "paper" does so by the paper's method alone (eqs. 2 to
                 9): one pass, no occlusion guard, no texture. Sets of single views are in the
@@ -182,7 +182,7 @@ def predict(
     depth_kind: DepthKind = "auto",
     depth_unit: str | float | None = None,
     residual: Residual = None,
-    fill: FillTexture = "auto",
+    fill: str = "auto",
     mode: FillMode = "scene",
     device: str = "auto",
     renderer: Renderer | None = None,

@@ -30,9 +30,15 @@ from spackle.depth.units import RELATIVE_KINDS, UNIT_ADVICE
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio
-from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
+from spackle.residual.architectures import (
+    SHIPPED,
+    load_residual,
+    network_class,
+    shipped_network,
+)
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError, check_name
+from spackle.runtime.plugins import check_name_or_plugin, is_plugin
 from spackle.runtime.progress import Progress, Reporter
 from spackle.scene import Scene, SceneReport, ViewHoles
 from spackle.scene_fill.context import FillContext
@@ -41,8 +47,9 @@ from spackle.scene_fill.texture import Texture, exemplar_texture, painted_textur
 from spackle.views import GivenPath, PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed_weights
 
-# Where the texture in the holes comes from; see `open_texture`.
+# The built-in sources of the texture in the holes; see `open_texture`.
 FillTexture = Literal["auto", "network", "exemplar", "lama", "none"]
+FILL_TEXTURES: tuple[str, ...] = get_args(FillTexture)
 # One set of aux Gaussians for all views; one set for each view; or one set for each view by the
 # paper's method alone, without what Spackle adds to it.
 FillMode = Literal["scene", "view", "paper"]
@@ -55,11 +62,13 @@ class FillOptions:
     # A file of weights for the network; "initial": no network; "none": no fill; None: the shipped
     # weights if there are any.
     residual: str | None = None
-    fill: FillTexture = "auto"
+    # The network's class, `package.module:Class`, if the weights are of another package's network.
+    residual_network: str | None = None
+    fill: str = "auto"  # a `FillTexture`, or an inpainter `package.module:Class`
     mode: FillMode = "scene"
 
     @property
-    def texture(self) -> FillTexture:
+    def texture(self) -> str:
         """Where the texture comes from, with "auto" decided; "none" if nothing is to be filled."""
         if self.residual == "none":
             return "none"
@@ -91,9 +100,9 @@ class FillOptions:
 
     def check(self) -> None:
         """InputError if an option has an unknown value, or two options contradict each other."""
-        check_name("fill", self.fill, get_args(FillTexture))
+        check_name_or_plugin("fill", self.fill, FILL_TEXTURES)
         check_name("mode", self.mode, get_args(FillMode))
-        if self.mode == "paper" and self.fill in ("exemplar", "lama"):
+        if self.mode == "paper" and (self.fill in ("exemplar", "lama") or is_plugin(self.fill)):
             raise InputError(
                 f"`fill` {self.fill}: the paper's method adds no texture: "
                 "leave it out, or give `mode` view"
@@ -101,6 +110,10 @@ class FillOptions:
 
     def load_network(self) -> ResidualNet | None:
         """Load the network, or None if none is used; InputError for a file that cannot be used."""
+        # The user has named the class, so its module may be imported; the file alone may not ask
+        # for this.
+        if self.residual_network is not None:
+            network_class(self.residual_network, "residual_network")
         return None if self.weights_file is None else load_residual(self.weights_file)
 
 
@@ -488,7 +501,7 @@ def complete(
     *,
     exact: bool = False,
     network: ResidualNet | Literal["shipped"] | None = "shipped",
-    fill: FillTexture = "auto",
+    fill: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
 ) -> Scene:
@@ -521,29 +534,34 @@ def complete(
     return Scene(prediction.gaussians, filled.aux, prediction.camera, report=report)
 
 
-def resolve_texture(fill: FillTexture) -> FillTexture:
-    """Replace "auto" by "lama" if LaMa's weights have been downloaded, else by "exemplar"."""
+def resolve_texture(fill: str) -> str:
+    """Replace "auto" by "lama" if LaMa's weights have been downloaded, else by "exemplar".
+
+    InputError for an unknown name.
+    """
+    check_name_or_plugin("fill", fill, FILL_TEXTURES)
     if fill != "auto":
         return fill
     return "lama" if installed_weights("lama") else "exemplar"
 
 
-def open_texture(fill: FillTexture) -> Texture | None:
+def open_texture(fill: str) -> Texture | None:
     """The function that draws texture into the holes of a view.
 
     "lama" inpaints the widest views by the network LaMa, "exemplar" copies patches of the same
-    view, and "auto" is "lama" if its weights have been downloaded, else "exemplar". None for
-    "network" and "none", which add no texture. InputError for "lama" without its weights.
+    view, and "auto" is "lama" if its weights have been downloaded, else "exemplar". A class of
+    another package, `package.module:Class`, inpaints as LaMa does. None for "network" and "none",
+    which add no texture. InputError for an unknown name, and for "lama" without its weights.
     """
     texture = resolve_texture(fill)
-    if texture == "lama":
-        return _open_lama()
+    if texture == "lama" or is_plugin(texture):
+        return _open_inpainter(texture)
     if texture == "exemplar":
         return exemplar_texture
     return None
 
 
 @functools.cache
-def _open_lama() -> Texture:
-    """The function that inpaints views by LaMa; it is kept, because loading LaMa takes seconds."""
-    return functools.partial(painted_texture, get_inpainter("lama", InpainterOptions()))
+def _open_inpainter(name: str) -> Texture:
+    """The function that inpaints views; it is kept, because loading a network takes seconds."""
+    return functools.partial(painted_texture, get_inpainter(name, InpainterOptions(), "fill"))

@@ -141,7 +141,7 @@ def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> Non
         (next(n for n in ARCHITECTURES if n != name), "another network's"),
         ("vit", "unknown architecture"),
         ("os:remove", "not a subclass"),
-        ("never_imported:Network", "unknown architecture"),
+        ("never_imported:Network", "add `residual_network` never_imported:Network"),
     ):
         save_file(tensors, path, {ARCHITECTURE_KEY: wrong})
         with pytest.raises(InputError, match=said):
@@ -173,7 +173,7 @@ def test_a_network_of_another_package_is_trained_saved_and_read(
     path = tmp_path / "weights.safetensors"
     tensors = {key: value.contiguous() for key, value in TwoLayers().state_dict().items()}
     save_file(tensors, path, {ARCHITECTURE_KEY: TwoLayers.name})
-    with pytest.raises(InputError, match="unknown architecture tests_own_network:TwoLayers"):
+    with pytest.raises(InputError, match="add `residual_network` tests_own_network:TwoLayers"):
         load_residual(path)  # a file must not import modules
 
     monkeypatch.setitem(sys.modules, "tests_own_network", module)

@@ -27,6 +27,7 @@ from spackle.bases.settings import (
     ROUGH_GEOMETRY_ADVICE,
     BaseSettings,
     Depth,
+    load_base_class,
 )
 from spackle.bases.sharp.base import SharpBase
 from spackle.bases.transformers import HfBase
@@ -43,7 +44,6 @@ from spackle.depth.units import (
 )
 from spackle.runtime.device import NotEnoughMemory
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.plugins import load_plugin
 from spackle.runtime.progress import Progress
 
 LOG = logging.getLogger("spackle")
@@ -116,10 +116,9 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
     device = None if settings.device == "auto" else settings.device
     # Code of another package runs here, and only for a name that the user gave.
     if settings.kind == PLUGIN_KIND:
-        plugin = load_plugin(name, "base")
+        base_class = load_base_class(name)
         with as_input_error(f"`base` {name}", "cannot be opened: {reason}"):
-            opened: Base = plugin()
-        return opened
+            return base_class()
     if name.startswith(HF_PREFIX):
         model = name.removeprefix(HF_PREFIX)
         return HfBase.load(model, device=device, precision=settings.precision)

@@ -12,13 +12,14 @@ from pathlib import Path
 
 from rich.filesize import decimal
 
-from spackle.bases import lite
+from spackle.bases import Base, lite
 from spackle.bases.sharp.base import check_window_batch
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.readers import DepthValue
 from spackle.depth.units import DEPTH_KINDS, RELATIVE_KINDS, DepthKind, parse_depth_unit
 from spackle.runtime.device import PRECISIONS, Precision
 from spackle.runtime.errors import InputError, check_name
+from spackle.runtime.plugins import check_name_or_plugin, is_plugin, load_plugin, plugin_file
 from spackle.weights import PUBLISHED_WEIGHTS, installed_weights
 
 AUTO = "auto"  # the best base that a photo and this machine allow
@@ -150,6 +151,14 @@ def _installed_weights(base_name: str) -> Path | None:
     return None
 
 
+def load_base_class(name: str) -> type[Base]:
+    """The class of another package's base, `package.module:Class`; InputError if there is none."""
+    base_class: type[Base] = load_plugin(
+        name, "base", needs=("predict",), like="spackle.bases.Base"
+    )
+    return base_class
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BaseSettings:
     """A base's name and options."""
@@ -191,7 +200,7 @@ class BaseSettings:
         """The base's key in `BASE_KINDS`: its name, "hf", or the kind of other packages' bases."""
         if self.name.startswith(HF_PREFIX):
             return "hf"
-        return PLUGIN_KIND if ":" in self.name else self.resolved_name
+        return PLUGIN_KIND if is_plugin(self.name) else self.resolved_name
 
     @property
     def uses_network(self) -> bool:
@@ -221,8 +230,12 @@ class BaseSettings:
         """The files on this machine that predictions depend on: weights and their configuration.
 
         The key of a file of weights is the name of its base. If the base is a folder of a Hugging
-        Face model, the key is the file's own name.
+        Face model, the key is the file's own name. A class of another package is its module's file.
         """
+        if self.kind == PLUGIN_KIND:
+            file = plugin_file(self.name, "base")
+            return {} if file is None else {self.name: file}
+
         # transformers reads several files of a model's folder.
         if self.model_folder is not None:
             matches = [
@@ -271,10 +284,12 @@ class BaseSettings:
                 f"`base` {HF_PREFIX} names no model: "
                 "give a Hugging Face model as owner/name, or a folder"
             )
-        # A colon marks a Hugging Face model or a class of another package. Loading shows whether it
-        # exists.
-        if ":" not in self.name:
-            check_name("base", self.name, (AUTO, RGBD, *NETWORK_BASES))
+        # Loading shows whether a Hugging Face model exists.
+        if self.name.startswith(HF_PREFIX):
+            return
+        check_name_or_plugin("base", self.name, (AUTO, RGBD, *NETWORK_BASES))
+        if is_plugin(self.name):
+            load_base_class(self.name)
 
     def _given_options(self) -> dict[str, object]:
         """The options that only some bases take and that the user has set, with their values."""

@@ -13,6 +13,7 @@ from spackle.cli.evaluation_options import (
     DisparitiesOption,
     FolderArgument,
     LimitOption,
+    ResidualNetworkOption,
     ResidualOption,
     ResultsOption,
     SideOption,
@@ -38,6 +39,7 @@ def bench(
     precision: PrecisionOption = "auto",
     sharp_windows: SharpWindowsOption = None,
     residual: ResidualOption = None,
+    residual_network: ResidualNetworkOption = None,
     limit: LimitOption = None,
     runs: Annotated[
         int, typer.Option(min=1, max=1000, help="Number of timed runs of all steps after the base.")
@@ -78,6 +80,7 @@ def bench(
             windows_per_batch=sharp_windows,
         ),
         residual=residual,
+        residual_network=residual_network,
         limit=limit,
         runs=runs,
         base_runs=base_runs,

@@ -95,7 +95,7 @@ def dataset_build(
         str,
         typer.Option(
             metavar="NAME",
-            help=f"What completes the views: {INPAINTERS}; geometry; or none.",
+            help=f"What completes the views: {INPAINTERS}; geometry; none.",
         ),
     ] = "exemplar",
     inpainter_weights: Annotated[

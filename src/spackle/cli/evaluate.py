@@ -15,6 +15,7 @@ from spackle.cli.evaluation_options import (
     FolderArgument,
     HtmlOption,
     LimitOption,
+    ResidualNetworkOption,
     ResidualOption,
     ResultsOption,
     SideOption,
@@ -44,7 +45,7 @@ def evaluate(
         str,
         typer.Option(
             metavar="A,B,…",
-            help=f"Methods, with commas: {METHODS}, or package.module:Class.",
+            help=f"Methods, with commas: {METHODS}, or package.module:Name.",
         ),
     ] = "base,paper-initial,paper,spackle",
     disparity: DisparitiesOption = "0.3,0.4,0.5",
@@ -68,6 +69,7 @@ def evaluate(
     precision: PrecisionOption = "auto",
     sharp_windows: SharpWindowsOption = None,
     residual: ResidualOption = None,
+    residual_network: ResidualNetworkOption = None,
     direct_ft: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")
     ] = None,
@@ -129,6 +131,7 @@ def evaluate(
             windows_per_batch=sharp_windows,
         ),
         residual=residual,
+        residual_network=residual_network,
         direct_ft=direct_ft,
         dense_residual=dense_residual,
         inpainter=inpainter,

@@ -40,6 +40,12 @@ ResidualOption = Annotated[
         help="Weights of the residual; default: those in the package, else initial.",
     ),
 ]
+ResidualNetworkOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MODULE:CLASS", help="The network of --residual, if another package defines it."
+    ),
+]
 SideOption = Annotated[
     int | None,
     typer.Option(

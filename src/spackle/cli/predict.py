@@ -120,12 +120,21 @@ def predict(
             "weights in the package.",
         ),
     ] = None,
-    fill: Annotated[
-        Literal["auto", "network", "exemplar", "lama", "none"],
+    residual_network: Annotated[
+        str | None,
         typer.Option(
+            metavar="MODULE:CLASS",
+            hidden=True,
+            help="The network of --residual, if another package defines it.",
+        ),
+    ] = None,
+    fill: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
             help="Texture in the holes. lama: LaMa (`spackle weights get lama`); exemplar: patches "
-            "of the photo; network: no texture; none: no fill; auto: lama if its weights are "
-            "downloaded, else exemplar."
+            "of the photo; network: no texture; none: no fill; package.module:Class: an inpainter "
+            "of another package; auto: lama if its weights are downloaded, else exemplar.",
         ),
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
@@ -253,7 +262,9 @@ def predict(
         scene=PipelineOptions(
             base=base_settings,
             path=path_and_video,
-            fill=FillOptions(residual=residual, fill=fill, mode=mode),
+            fill=FillOptions(
+                residual=residual, residual_network=residual_network, fill=fill, mode=mode
+            ),
         ),
         photo=PhotoOptions(
             lens={"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov},

@@ -9,8 +9,7 @@ from spackle.inpaint.lama import LamaInpainter
 from spackle.inpaint.plain import ExemplarInpainter, OpencvInpainter
 from spackle.inpaint.propainter import PropainterInpainter
 from spackle.inpaint.protocol import Inpainter, InpainterOptions
-from spackle.runtime.errors import check_name
-from spackle.runtime.plugins import load_plugin
+from spackle.runtime.plugins import check_name_or_plugin, is_plugin, load_plugin
 
 # Packages such as OpenCV are imported only when one of these classes is called.
 INPAINTERS: dict[str, type[Inpainter]] = {
@@ -21,31 +20,38 @@ INPAINTERS: dict[str, type[Inpainter]] = {
 }
 
 
+# What a class of another package must have.
+NEEDED_ATTRIBUTES = ("name", "version", "uses_network", "paints_views_together", "notice", "paint")
+
+
 def is_inpainter(name: str) -> bool:
     """Return whether a name is that of a built-in inpainter or of a `package.module:Class`."""
-    return name in INPAINTERS or ":" in name
+    return name in INPAINTERS or is_plugin(name)
 
 
-def inpainter_class(name: str) -> type[Inpainter]:
+def inpainter_class(name: str, option: str = "inpainter") -> type[Inpainter]:
     """Return the class of an inpainter.
 
     Args:
         name: a key of `INPAINTERS`, or `package.module:Class` for a class of another package.
+        option: the Python name of the option that was given, for messages.
 
     Raises:
         InputError: the name is unknown, or the other package cannot be imported.
     """
-    if ":" in name:
-        plugin: type[Inpainter] = load_plugin(name, "inpainter")
-        return plugin
-    check_name("inpainter", name, INPAINTERS)
-    return INPAINTERS[name]
+    check_name_or_plugin(option, name, INPAINTERS)
+    if not is_plugin(name):
+        return INPAINTERS[name]
+    plugin: type[Inpainter] = load_plugin(
+        name, option, needs=NEEDED_ATTRIBUTES, like="spackle.inpaint.plain.PlainInpainter"
+    )
+    return plugin
 
 
-def get_inpainter(name: str, options: InpainterOptions) -> Inpainter:
+def get_inpainter(name: str, options: InpainterOptions, option: str = "inpainter") -> Inpainter:
     """Open an inpainter by its name, see `inpainter_class`.
 
     Raises:
         InputError: the name is unknown, or a package or weights are missing.
     """
-    return inpainter_class(name)(options)
+    return inpainter_class(name, option)(options)

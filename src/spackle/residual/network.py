@@ -30,7 +30,7 @@ class ResidualNet(nn.Module):
     then returns the deltas of this rectangle of cells only.
     """
 
-    # In recipes and weight files; for a network of another package, "package.module:Class".
+    # In recipes and weight files; a class that gives none is called "package.module:Class".
     name: ClassVar[str]
     # The inputs by name, in the order of their channels. Inputs that are not named are not
     # computed.
@@ -39,6 +39,12 @@ class ResidualNet(nn.Module):
     local: ClassVar[bool]
     # The subclass of `ViewCompletion` that computes the inputs; None: `ViewCompletion` itself.
     view_type: ClassVar[type[Any] | None] = None
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Name a network of another package by its module and class, by which it is found."""
+        super().__init_subclass__(**options)
+        if "name" not in vars(cls):
+            cls.name = f"{cls.__module__}:{cls.__qualname__}"
 
     @classmethod
     def untrained_for(cls, tensors: Mapping[str, Tensor]) -> ResidualNet:

@@ -37,6 +37,7 @@ from spackle.runtime.errors import InputError
 from spackle.runtime.files import check_file
 from spackle.runtime.folders import results_folder
 from spackle.runtime.kernels import is_compiled
+from spackle.runtime.plugins import plugin_file
 from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
 from spackle.runtime.workers import parallel_map, torch_threads
 from spackle.video.frames import video_problem
@@ -448,6 +449,9 @@ def _shared_digest(options: PredictOptions) -> str:
         "calibration": base.calib,
         "weights": fill.weights_file,
         "LaMa": installed_weights("lama") if fill.texture == "lama" else None,
+        # Code of another package, by which results may change, too.
+        "inpainter": plugin_file(fill.texture, "fill"),
+        "network": plugin_file(fill.residual_network or "", "residual_network"),
         **base.model_files,
     }
     fingerprints = {

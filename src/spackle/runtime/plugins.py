@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -73,6 +75,34 @@ def load_plugin(name: str, option: str, *, needs: Sequence[str] = (), like: str 
         if not hasattr(plugin, needed_name):
             raise InputError(f"`{option}` {name}: has no {needed_name}: write a class like {like}")
     return plugin
+
+
+def plugin_file(name: str, option: str) -> Path | None:
+    """The file of the module that `package.module:Name` is in; None for other names.
+
+    Results depend on this file, so records of results have its digest. InputError, which names the
+    `option`, if the module cannot be imported.
+    """
+    if not is_plugin(name):
+        return None
+    module_name, _, _ = name.partition(":")
+    module = _import_module(module_name, f"`{option}` {name}")
+    file = getattr(module, "__file__", None)  # a module that a program has made has none
+    return None if file is None else Path(file)
+
+
+def plugin_digests(names: Mapping[str, str]) -> dict[str, str]:
+    """SHA-256 of the file of each plug-in's module, by the plug-in's name, for records of results.
+
+    `names` has the name under each option, such as {"inpainter": "my_module:Mine"}; built-in names
+    and modules without a file are left out.
+    """
+    digests = {}
+    for option, name in names.items():
+        file = plugin_file(name, option)
+        if file is not None:
+            digests[name] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return digests
 
 
 def load_function(name: str, option: str) -> Callable[..., Any]:

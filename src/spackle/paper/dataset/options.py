@@ -23,7 +23,8 @@ from spackle.paper.dataset.photos import PhotoFile
 from spackle.paper.dataset.views import COMPLETIONS
 from spackle.residual import MASK_THRESHOLD
 from spackle.runtime.digests import file_fingerprint, json_digest
-from spackle.runtime.errors import InputError, check_name
+from spackle.runtime.errors import InputError
+from spackle.runtime.plugins import check_name_or_plugin, plugin_digests
 from spackle.weights import weights_digest, weights_digests
 
 
@@ -100,7 +101,7 @@ class DatasetOptions:
         if is_inpainter(self.inpainter):
             takes_options = inpainter_class(self.inpainter).uses_network
         else:
-            check_name("inpainter", self.inpainter, COMPLETIONS)
+            check_name_or_plugin("inpainter", self.inpainter, COMPLETIONS)
         has_options = self.inpainter_weights is not None or self.inpainter_side is not None
         if has_options and not takes_options:
             raise InputError(
@@ -150,6 +151,9 @@ def dataset_configuration(
         completion["weights"] = {
             name: weights_digest(file) for name, file in inpainter.weight_files.items()
         }
+    code = plugin_digests({"inpainter": options.inpainter})
+    if code:
+        completion["code"] = code
     inputs_digest = json_digest([options.input_digests(photo) for photo in photos])
     return {
         "spackle": spackle.__version__,

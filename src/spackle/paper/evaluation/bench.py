@@ -65,6 +65,7 @@ CONFIG_KEYS_OF_EVALUATION = (
     "disparities",
     "base",
     "residual",
+    "code",  # only if code of other packages is used
     "device",
 )
 

@@ -29,12 +29,12 @@ from spackle.paper.evaluation.options import EvaluateOptions
 from spackle.paper.evaluation.published_metrics import PUBLISHED_METRICS, open_published_metrics
 from spackle.paper.evaluation.table import NOT_RUN
 from spackle.paper.training.feature_networks import load_features
-from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.architectures import load_residual
 from spackle.runtime.device import pick_dtype
 from spackle.runtime.digests import json_digest
+from spackle.runtime.plugins import plugin_digests
 from spackle.scene_fill import FillContext
 from spackle.weights import weights_digest, weights_digests
 
@@ -92,7 +92,7 @@ def open_evaluation(options: EvaluateOptions, earlier_metrics: Sequence[str] = (
     # What fails fast comes first: options, files of the dataset, weights, packages.
     options.check()
     cases = _cases_to_evaluate(options)
-    network = FillOptions(residual=options.residual).load_network()
+    network = options.fill.load_network()
     dense_network = network
     if options.dense_residual is not None:
         dense_network = load_residual(options.dense_residual)
@@ -242,6 +242,10 @@ def _configuration(
         config["about_scenes"] = label.about
     if options.dense_residual is not None:
         config["dense_residual"] = weights_digest(options.dense_residual)
+    # Code of other packages, by which results may change; there is a record only if there is any.
+    code = plugin_digests(options.plugin_names)
+    if code:
+        config["code"] = code
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.weight_files.items()}
         config["inpainter"] = {
@@ -267,7 +271,7 @@ def _base_configuration(options: EvaluateOptions) -> dict[str, Any]:
 
 def _residual_configuration(options: EvaluateOptions, renderer: Renderer) -> dict[str, Any]:
     """What config.json records about the residual network: its weights and its precision."""
-    weights_file = FillOptions(residual=options.residual).weights_file
+    weights_file = options.fill.weights_file
     if weights_file is None:  # no network changes the first guess of the Gaussians that fill holes
         return {"weights": "initial", "sha256": None, "precision": None}
 

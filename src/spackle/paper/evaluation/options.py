@@ -12,11 +12,13 @@ import torch
 from spackle.bases.settings import BaseSettings
 from spackle.core.photo import MAX_WORKING_SIDE_PX
 from spackle.core.trajectories import MAX_DISPARITY
+from spackle.inpaint import inpainter_class
 from spackle.paper.evaluation.case import SecondViews
 from spackle.paper.evaluation.datasets import find_dataset
 from spackle.paper.evaluation.method_descriptions import METHODS
 from spackle.paper.evaluation.metrics import METRICS
 from spackle.paper.evaluation.paper_numbers import PAPER_DISPARITIES
+from spackle.pipeline import FillOptions
 from spackle.runtime.device import pick_device
 from spackle.runtime.errors import InputError, check_name
 from spackle.runtime.plugins import check_name_or_plugin, is_plugin, load_function
@@ -55,6 +57,8 @@ class EvaluateOptions:
     residual: str | None = (
         None  # a file of weights, or "initial"; None: the shipped weights, if any
     )
+    # The network's class, `package.module:Class`, if `residual` has weights of another package's.
+    residual_network: str | None = None
     direct_ft: Path | None = None  # weights of the method direct-ft
     # Weights of the residual network for the method dense, which should be trained with Gaussians
     # in all cells; None: those of `residual`.
@@ -68,6 +72,21 @@ class EvaluateOptions:
     side: int | None = None
     limit: int | None = None  # the number of images, spread over the dataset; None: all
     download_metrics: bool = False  # whether pyiqa may fetch the weights of metrics
+
+    @property
+    def fill(self) -> FillOptions:
+        """The residual network, as options of the fill, which load it."""
+        return FillOptions(residual=self.residual, residual_network=self.residual_network)
+
+    @property
+    def plugin_names(self) -> dict[str, str]:
+        """The names of code that may be of other packages, each under a different option."""
+        names = {
+            "dataset": self.dataset,
+            "inpainter": self.inpainter,
+            "residual_network": self.residual_network or "",
+        }
+        return names | {f"methods {method}": method for method in self.methods}
 
     @property
     def compares_with_photos(self) -> bool:
@@ -110,6 +129,7 @@ class EvaluateOptions:
         """Raise an InputError if an option cannot be used; the dataset's files are not read."""
         find_dataset(self.dataset)
         self._check_methods()
+        inpainter_class(self.inpainter)  # fails for an unknown name
         self._check_metrics()
         # The base "auto" is refused: it depends on what is installed, and results with different
         # bases cannot be compared.
@@ -175,6 +195,8 @@ class BenchOptions:
     residual: str | None = (
         None  # a file of weights, or "initial"; None: the shipped weights, if any
     )
+    # The network's class, `package.module:Class`, if `residual` has weights of another package's.
+    residual_network: str | None = None
     side: int | None = None  # long side of the views, in pixels; None: 1280, as in the paper
     limit: int | None = None  # the number of images, spread over the dataset; None: all
     runs: int = 5  # how often each stage after the base is timed
@@ -198,6 +220,7 @@ class BenchOptions:
             metrics=(),  # a benchmark measures times, not images
             base=self.base,
             residual=self.residual,
+            residual_network=self.residual_network,
             side=self.side,
             limit=self.limit,
         )
