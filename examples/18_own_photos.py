@@ -34,7 +34,7 @@ def main(left: Path, right: Path, *numbers: str) -> None:
     }
     (scene / "scene.json").write_text(json.dumps(description))
     names = {"title": "My garden", "terms": "my photos, CC BY 4.0"}
-    (results / "photos" / "dataset.json").write_text(json.dumps(names))
+    (results / "photos" / "about.json").write_text(json.dumps(names))
 
     options = EvaluateOptions(
         dataset="pairs",

@@ -33,7 +33,8 @@ from spackle.paper.dataset.inspect import find_problems
 from spackle.paper.dataset.photos import find_photos
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.evaluation.case import load_case
-from spackle.paper.evaluation.datasets import find_dataset, read_cases
+from spackle.paper.evaluation.datasets import find_dataset, find_scenes, read_cases
+from spackle.paper.evaluation.datasets.labels import read_label
 from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.runtime.digests import json_digest
@@ -159,7 +160,7 @@ def _read_foreign_cameras(folder: Path) -> None:
 
 
 def _read_tree(name: str, folder: Path) -> None:
-    find_dataset(name).described(folder)
+    read_label(find_dataset(name), list(find_scenes(name, folder).values()), folder)
     case = read_cases(name, folder)[0]
     load_case(case)
     for read in (case.read_depth, case.read_points):

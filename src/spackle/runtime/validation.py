@@ -24,7 +24,12 @@ def validated(model: type[Model], content: Any, where: object) -> Model:
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
+        problems = error.errors()
+        # A key with a typing error also lacks where it should be; the error tells more.
+        unknown_keys = [one for one in problems if one["type"] == "extra_forbidden"]
+        first = problems[0]
+        if first["type"] == "missing" and unknown_keys:
+            first = unknown_keys[0]
         if first["type"] == "extra_forbidden":
             problem = _unknown_key(model, first["loc"], first["input"])
         else:

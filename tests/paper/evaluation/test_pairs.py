@@ -127,7 +127,7 @@ def test_own_pairs_and_posed_photos_are_measured_under_their_own_name(tmp_path: 
     )
     write_metres(folder / "depth.npy")
     description = {"title": "Boxes & more_1", "terms": "CC0: do what you like"}
-    (root / "dataset.json").write_text(json.dumps(description))
+    (root / "about.json").write_text(json.dumps(description))
 
     words = ("--base", "rgbd", "--methods", "base,spackle", "--html")
     psnr = evaluated(root, output, *words)
@@ -150,7 +150,7 @@ def test_own_pairs_and_posed_photos_are_measured_under_their_own_name(tmp_path: 
     assert "CC0: do what you like" in report
 
     # Another title is another dataset: the folder of the results says what it holds.
-    (root / "dataset.json").write_text(json.dumps(description | {"title": "Other"}))
+    (root / "about.json").write_text(json.dumps(description | {"title": "Other"}))
     near = ("--dataset", "pairs", "--protocol", "near-view", "--metrics", "psnr")
     again = run("evaluate", root, *near, *words[:4], "-o", output)
     assert (again.code, "title" in again.lines[-1]) == (2, True), again.err
@@ -307,21 +307,27 @@ def test_a_bad_description_is_one_line(tmp_path: Path, content: object, message:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"title": "Middlebury"}', "title Middlebury is that of a dataset of the paper"),
+        ('{"title": "Middlebury"}', "about.json: Middlebury is a dataset of the paper"),
         ('{"titel": "Mine"}', "titel: there is no such key: did you mean title?"),
         ('{"title": "two\\nlines"}', "title: string should match pattern"),
         ('{"title": ""}', "title: string should have at least 1 character"),
-        ("{", "dataset.json: not JSON"),
+        ("{", "about.json: not JSON"),
     ],
 )
 def test_a_bad_title_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     photos = ("left.png", "right.png")
     write_scene(tmp_path / "data" / "a", rectified(disparity="disp.pfm"), *photos, "disp.pfm")
-    (tmp_path / "data" / "dataset.json").write_text(text)
+    (tmp_path / "data" / "about.json").write_text(text)
     words = ("--dataset", "pairs", "--base", "rgbd", "--metrics", "none", "-o", tmp_path / "out")
     refuses(run("evaluate", tmp_path / "data", *words), message)
-    with pytest.raises(InputError):
-        find_dataset("pairs").described(tmp_path / "data")
+
+
+def test_a_folder_named_like_a_dataset_of_the_paper_needs_a_title(tmp_path: Path) -> None:
+    photos = ("left.png", "right.png")
+    root = tmp_path / "LLFF"
+    write_scene(root / "a", rectified(), *photos)
+    words = ("--dataset", "pairs", "--base", "lite", "--metrics", "none", "--methods", "base")
+    refuses(run("evaluate", root, *words, "-o", tmp_path / "out"), "choose another title in about")
 
 
 def test_names_of_datasets_that_do_not_exist(tmp_path: Path) -> None:

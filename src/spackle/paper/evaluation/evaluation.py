@@ -212,8 +212,9 @@ def _configuration(
         inpainter: of the method inpaint2d.
         renderer: its device is recorded.
     """
-    dataset = find_dataset(options.dataset).described(options.root)
-    label = read_label(dataset, list(find_scenes(options.dataset, options.root).values()))
+    dataset = find_dataset(options.dataset)
+    scenes = find_scenes(options.dataset, options.root)
+    label = read_label(dataset, list(scenes.values()), options.root)
     names_digest = json_digest([case.name for case in cases])
 
     # Weights are recorded by digest, because paths differ between machines.

@@ -15,14 +15,6 @@ def folder_name(folder: Path) -> str:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DatasetDescription:
-    """What results say about the photos of a dataset."""
-
-    title: str
-    terms: str
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class EvalDataset:
     """A dataset in the layout of files in which it is published.
 
@@ -31,10 +23,10 @@ class EvalDataset:
     """
 
     name: str  # for the option `dataset`
-    title: str  # in tables; for the paper's datasets their name in the paper's tables
+    # In tables; for the paper's datasets their name in the paper's tables. "": each folder has a
+    # title of its own, see labels.py.
+    title: str
     terms: str  # terms of use, in a few words
-    # Reads title and terms from the root folder, if it is the user who gives them; else None.
-    describe: Callable[[Path], DatasetDescription] | None = None
     # A folder is a scene if it holds one of these files or folders, or a match of a pattern such as
     # "*.jpg".
     markers: Sequence[str]
@@ -47,10 +39,3 @@ class EvalDataset:
     second_views: SecondViews = "spread"
     # From a scene's folder to a name that no other scene has.
     scene_name: Callable[[Path], str] = folder_name
-
-    def described(self, root: Path) -> EvalDataset:
-        """This dataset, with the title and terms that its folder `root` gives, if it gives any."""
-        if self.describe is None:
-            return self
-        description = self.describe(root)
-        return dataclasses.replace(self, title=description.title, terms=description.terms)

@@ -1,7 +1,6 @@
 """Photos of your own: rectified pairs and posed photos, which a scene.json describes.
 
-docs/evaluation.md explains each key. A file dataset.json in the root folder names the dataset and
-the terms of use of its photos.
+docs/evaluation.md explains each key.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from spackle.depth.depth_map import DepthMap
 from spackle.depth.readers import load_depth, read_stored_depth
 from spackle.formats.camera_files import Number, Row3, Row4, SidePx, checked_camera
 from spackle.paper.evaluation.case import Case
-from spackle.paper.evaluation.datasets.dataset import DatasetDescription, EvalDataset
+from spackle.paper.evaluation.datasets.dataset import EvalDataset
 from spackle.paper.evaluation.datasets.multiview import (
     MAX_NEAR_VIEWS,
     ROTATION_TOLERANCE,
@@ -35,17 +34,12 @@ from spackle.paper.evaluation.datasets.multiview import (
     make_cases,
 )
 from spackle.paper.evaluation.datasets.stereo import rectified_pair
-from spackle.paper.evaluation.paper_numbers import PAPER_IMAGE_COUNTS
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.validation import validated
 
 SCENE_FILE = "scene.json"
-DESCRIPTION_FILE = "dataset.json"  # in the root folder
 MAX_JSON_BYTES = 1 << 24  # enough for the poses of 10,000 photos
 MAX_PHOTOS = 10_000  # of a scene
-MAX_TITLE = 60  # characters, so that it fits into the tables
-MAX_TERMS = 300  # characters
-ONE_LINE = r"^[^\x00-\x1f\x7f]*$"  # no line breaks or other control characters
 
 FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -56,13 +50,6 @@ class _Entry(BaseModel):
     """A part of a file; other keys than its own are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _Description(_Entry):
-    """The content of dataset.json."""
-
-    title: Annotated[str, Field(min_length=1, max_length=MAX_TITLE, pattern=ONE_LINE)] | None = None
-    terms: Annotated[str, Field(max_length=MAX_TERMS, pattern=ONE_LINE)] = ""
 
 
 class _RectifiedPair(_Entry):
@@ -100,26 +87,6 @@ class _PosedPhotos(_Entry):
     K: tuple[Row3, Row3, Row3] | None = None  # of photos without one
     # Width and height in pixels of the photos that K describes; None: the size of each photo.
     size: tuple[SidePx, SidePx] | None = None
-
-
-def describe_pairs(root: Path) -> DatasetDescription:
-    """Title and terms of use from a folder's dataset.json; without it, the folder's name.
-
-    Raises:
-        InputError: the file is damaged, or the title is that of one of the paper's datasets.
-    """
-    path = root / DESCRIPTION_FILE
-    description = _Description()
-    if path.exists():
-        description = _read(_Description, path, _read_json(path))
-    title = description.title or root.resolve().name
-    # Tables find the paper's numbers by the title.
-    if title.lower() in [paper_title.lower() for paper_title in PAPER_IMAGE_COUNTS]:
-        raise InputError(
-            f"{path}: title {title} is that of a dataset of the paper, whose numbers would stand "
-            "beside yours: choose another title"
-        )
-    return DatasetDescription(title=title, terms=description.terms)
 
 
 def pairs_cases(scenes: Mapping[str, Path]) -> list[Case]:
@@ -366,9 +333,8 @@ def _ascending(
 
 PAIRS = EvalDataset(
     name="pairs",
-    title="Pairs",
+    title="",  # that of the folder, or of its about.json
     terms="",
-    describe=describe_pairs,
     markers=(SCENE_FILE,),
     expected="SCENE/scene.json",
     read_cases=pairs_cases,
