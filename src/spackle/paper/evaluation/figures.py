@@ -17,6 +17,7 @@ from spackle.paper.evaluation.folder import load_run
 from spackle.paper.evaluation.measurements import Run
 from spackle.paper.evaluation.method_descriptions import METHODS
 from spackle.paper.evaluation.pictures import (
+    STORED_FORMATS,
     Box,
     GridPicture,
     GridRow,
@@ -237,7 +238,9 @@ def _figure_row(
         image: the image's name.
     """
     files = stored_pictures(run, folder, image)
-    pictures = {name: open_image(path, ("PNG",)).convert("RGB") for name, path in files.items()}
+    pictures = {
+        name: open_image(path, STORED_FORMATS).convert("RGB") for name, path in files.items()
+    }
     shows_hole = HOLE_PICTURE in figure.columns
 
     row = []

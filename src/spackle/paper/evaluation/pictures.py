@@ -28,6 +28,7 @@ SHEET_FONT_PX = 14
 SHEET_IMAGES = 6  # rows of a contact sheet
 
 MAX_STORED_SIDE_PX = 960  # the most pixels on a stored picture's longer side
+STORED_FORMATS = ("WEBP",)  # of stored pictures, by Pillow's names
 WEBP_QUALITY = 85
 WEBP_EFFORT = 4  # of 0 to 6; higher is slower and smaller
 
@@ -342,7 +343,9 @@ def _contact_sheet_row(
     # The stored pictures are those of this view.
     setting, view = run.view_with_largest_hole(image)
     files = stored_pictures(run, folder, image)
-    pictures = [GridPicture(open_image(files[name], ("PNG",)).convert("RGB")) for name in names]
+    pictures = [
+        GridPicture(open_image(files[name], STORED_FORMATS).convert("RGB")) for name in names
+    ]
     return GridRow(f"{image}, {setting} {view}: {value:.4g}", pictures)
 
 

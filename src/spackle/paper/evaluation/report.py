@@ -26,6 +26,7 @@ from spackle.paper.evaluation.measurements import (
 from spackle.paper.evaluation.metrics import METRICS
 from spackle.paper.evaluation.paper_numbers import PAPER_IMAGE_COUNTS
 from spackle.paper.evaluation.pictures import (
+    STORED_FORMATS,
     Ranking,
     evenly_spaced_indices,
     picture_title,
@@ -278,7 +279,7 @@ def _report_image(run: Run, name: str, position: str, files: Mapping[str, Path])
     # All pictures of a slider have the same size, because they show one view.
     names = list(files)
     left, right = _first_slider_pictures(names)
-    with open_image(files[left], ("PNG",)) as image:
+    with open_image(files[left], STORED_FORMATS) as image:
         width, height = image.size
 
     return ReportImage(
