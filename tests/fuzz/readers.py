@@ -10,6 +10,7 @@ import io
 import json
 import struct
 import tarfile
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -20,6 +21,7 @@ import numpy as np
 from helpers import DATA
 
 from spackle.clips.files import clip_frames, is_clip, read_clip
+from spackle.core.image_files import upright_size
 from spackle.core.keyframes import PathError
 from spackle.core.photo import load_photo, resize_photo
 from spackle.depth.in_photo.layouts import load_photo_depth
@@ -39,6 +41,7 @@ from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.runtime.digests import json_digest
 from spackle.runtime.errors import InputError, printable_line
+from spackle.web.work import check_photo
 from spackle.weights.checkpoints import read_tensors
 
 Files = dict[str, bytes]  # name in the case's folder → content
@@ -193,9 +196,20 @@ def _read_clip(folder: Path) -> None:
             pass
 
 
+def _read_photo(folder: Path) -> None:
+    """A photo with a colour statement, of more than 8 bits, or inside a raw file."""
+    path = _only(folder)
+    for note in resize_photo(load_photo(path, keep_frame=False), 32).notes:
+        _say(note)
+    upright_size(path)
+    with tempfile.TemporaryDirectory() as place:
+        check_photo(path, "photo", Path(place, "preview.jpg"))
+
+
 READERS: dict[str, Callable[[Path], object]] = {
     "pictures": lambda folder: resize_photo(load_photo(_only(folder), keep_frame=False), 32),
     "depth": _read_depth,
+    "photos": _read_photo,
     "portraits": lambda folder: load_photo_depth(_only(folder)),
     "ply": _read_ply,
     "foreign_scenes": _read_foreign_scene,

@@ -18,6 +18,7 @@ from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from torch import Tensor
 
+from spackle.core.color_spaces import REFERENCE_WHITE_NITS, color_space_of_cicp, to_srgb
 from spackle.core.image_files import check_pixel_count
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
@@ -36,6 +37,10 @@ HD_ROWS = 720
 PLAYLIST_FORMATS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}
 DECODING_ERRORS = (av.FFmpegError, ValueError)  # what PyAV raises for a damaged file
 HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # by FFmpeg's number of the transfer function
+# The light that becomes white in all frames of an HDR clip: the peak of most mastering displays, as
+# a multiple of the reference white. Each frame's own peak would let the brightness flicker.
+HDR_PEAK = 1000 / REFERENCE_WHITE_NITS
+UNSPECIFIED_PRIMARIES, BT2020_PRIMARIES = 2, 9  # FFmpeg's numbers, as those of CICP
 DEFAULT_FRAME_RATE = Fraction(25)  # frames a second, if the file states none
 
 
@@ -267,9 +272,33 @@ def _frame_to_rgb(
     if matrix == UNSPECIFIED_MATRIX:
         matrix = BT709 if frame.height >= HD_ROWS else BT601
     # `frame.reformat` would start new threads for each frame.
+    if int(frame.color_trc) in HDR_TRANSFERS:
+        return _hdr_frame_to_rgb(frame, width, height, matrix, reformatter)
     rgb = reformatter.reformat(frame, width, height, "rgb24", src_colorspace=matrix).to_ndarray()
     upright = np.ascontiguousarray(np.rot90(rgb, _quarter_turns(frame)))
     return torch.from_numpy(upright).float().div_(255)
+
+
+def _hdr_frame_to_rgb(
+    frame: av.VideoFrame, width: int, height: int, matrix: int, reformatter: VideoReformatter
+) -> Tensor:
+    """A frame in PQ or HLG as an upright image [H, W, 3] sRGB in 0..1.
+
+    Args:
+        frame: the frame.
+        width: of the frame in square pixels, before it is turned upright.
+        height: of the frame in square pixels.
+        matrix: FFmpeg's number of the matrix from YUV to RGB.
+        reformatter: converts YUV to RGB.
+    """
+    # 16 bits, because a step of 8 bits of these functions is visible.
+    codes = reformatter.reformat(frame, width, height, "rgb48le", src_colorspace=matrix)
+    upright = np.ascontiguousarray(np.rot90(codes.to_ndarray(), _quarter_turns(frame)))
+    primaries = int(frame.color_primaries)
+    if primaries == UNSPECIFIED_PRIMARIES:
+        primaries = BT2020_PRIMARIES
+    space = color_space_of_cicp(primaries, int(frame.color_trc))
+    return to_srgb(upright, 65535, space, peak=HDR_PEAK)
 
 
 def _quarter_turns(frame: av.VideoFrame) -> int:

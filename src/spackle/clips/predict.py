@@ -133,7 +133,7 @@ def predict_clip(
             clip = read_clip(path, pipeline.options.path.frames, progress)
         frame_predictor = FramePredictor(clip, pipeline, lens, reporter)
         if clip.hdr is not None:
-            reporter.log(f"{path.name}: the {clip.hdr} colours are not converted and may look pale")
+            reporter.log(f"{path.name}: its HDR colours ({clip.hdr}) become sRGB")
 
         measures: list[FrameMeasures] = []
         video = new_folder / VIDEO_FILE

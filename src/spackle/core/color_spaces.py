@@ -278,17 +278,18 @@ def color_space_of_cicp(primaries: int, transfer: int, *, is_full_range: bool = 
 # --- Conversion
 
 
-def to_srgb(codes: Codes, max_code: int, space: ColorSpace) -> Tensor:
+def to_srgb(codes: Codes, max_code: int, space: ColorSpace, peak: float | None = None) -> Tensor:
     """Convert whole numbers [H, W, 3] of a colour space to [H, W, 3] float32 sRGB in 0..1.
 
     Colours outside of sRGB are clipped. Of HDR (PQ and HLG), the reference white of 203 nits
-    becomes white, and what is brighter is compressed by the curve of ITU-R BT.2390, up to the
-    picture's own brightest light.
+    becomes white, and what is brighter is compressed by the curve of ITU-R BT.2390, up to `peak`.
 
     Args:
         codes: uint8 or uint16 in 0..max_code.
         max_code: the number that stands for 1, such as 255 or 1023.
         space: what the numbers mean.
+        peak: of HDR, the light that is the brightest white, in units of the reference white; None:
+            the picture's own brightest light.
     """
     if space.is_srgb:
         return torch.from_numpy(codes.astype(np.float32)).div_(max_code)
@@ -296,17 +297,18 @@ def to_srgb(codes: Codes, max_code: int, space: ColorSpace) -> Tensor:
     light_of_code = _light_of_codes(max_code, space)  # [3, max_code + 1]
     luminance = space.luminance.astype(np.float32)
     matrix = space.to_srgb_primaries.astype(np.float32)
-    peak = np.float32(1)
-    if space.transfer.is_hdr:
-        peak = np.float32(_peak_of(codes, light_of_code, space))
-    gains = tone_gains(float(peak)).astype(np.float32)
+    if not space.transfer.is_hdr:
+        peak = 1.0
+    elif peak is None:
+        peak = _peak_of(codes, light_of_code, space)
+    gains = tone_gains(peak).astype(np.float32)
     result = np.empty((*codes.shape[:2], 3), np.float32)
 
     def convert_rows(start: int, stop: int) -> None:
         """Convert the rows start..stop−1."""
         _convert(
             *(codes[start:stop], light_of_code, space.transfer.is_hlg, luminance),
-            *(peak, gains, matrix, _SRGB_OF_ROOT, result[start:stop]),
+            *(np.float32(peak), gains, matrix, _SRGB_OF_ROOT, result[start:stop]),
         )
 
     parallel_for_chunks(convert_rows, len(codes))

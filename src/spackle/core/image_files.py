@@ -119,6 +119,21 @@ def read_picture(path: str | os.PathLike[str], read: Callable[[OpenPicture], T])
             is a raw file without a large preview.
     """
     check_file(path, "photo")
+    try:
+        return _read_picture(path, read)
+    except InputError as error:
+        message = str(error)
+        cause = error.__cause__
+
+    # A new error, because the traceback of the first one refers to the decoder, whose threads and
+    # memory would live as long as the error.
+    if cause is not None:
+        cause = cause.with_traceback(None)
+    raise InputError(message) from cause
+
+
+def _read_picture(path: str | os.PathLike[str], read: Callable[[OpenPicture], T]) -> T:
+    """`read(picture)` of a photo's file; InputError as in `read_picture`."""
     with (
         as_input_error(path, "cannot be decoded ({reason}): the file is damaged or cut off"),
         warnings.catch_warnings(),
