@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import re
 import struct
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from helpers.photo_files import (
     box,
     chrm,
     colors_of,
+    deep_tiff,
     exif,
     gpano,
     heic,
@@ -262,6 +264,34 @@ DEEP_FILES = {
 @pytest.mark.parametrize("name", DEEP_FILES)
 def test_sixteen_bits_are_kept_until_the_colours_are_converted(tmp_path: Path, name: str) -> None:
     rgb = read(tmp_path, DEEP_FILES[name]())
+    assert abs(rgb - colors_of(as_srgb(DARK, "srgb"))).max() < 0.002
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("compression", [1, 5, 8, 32773])
+def test_every_layout_of_a_deep_tiff_is_read(tmp_path: Path, compression: int, order: str) -> None:
+    pixels = np.random.default_rng(0).integers(0, 65536, (45, 70, 3)).astype(np.uint16)
+    for predictor, planar, tile in itertools.product(
+        (False, True), (False, True), (None, (16, 32))
+    ):
+        layout = {"predictor": predictor, "planar": planar, "tile": tile}
+        content = deep_tiff(pixels, order=order, compression=compression, **layout)
+        (tmp_path / "a.tif").write_bytes(content)
+        rgb = load_photo(tmp_path / "a.tif").rgb.numpy()
+        assert abs(rgb - pixels / 65535).max() < 1e-6, layout
+
+
+def test_premultiplied_colours_of_a_deep_tiff_are_undone(tmp_path: Path) -> None:
+    half = np.concatenate([DEEP_CODES // 2, np.full_like(DEEP_CODES[..., :1], 32768)], axis=-1)
+    rgb = read(tmp_path, tiff(half, {338: (3, [1])}))
+    assert abs(rgb - (colors_of(DEEP) / 2 + 0.5)).max() < 1e-4
+
+
+def test_a_deep_animated_png_gives_its_first_picture(tmp_path: Path) -> None:
+    control = (b"acTL", struct.pack(">II", 2, 0))
+    height, width = DARK_CODES.shape[:2]
+    shown = (b"fcTL", struct.pack(">5I2H2B", 0, width, height, 0, 0, 1, 1, 0, 0))
+    rgb = read(tmp_path, png(DARK_CODES, GAMMA_1, control, shown))
     assert abs(rgb - colors_of(as_srgb(DARK, "srgb"))).max() < 0.002
 
 

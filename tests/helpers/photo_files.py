@@ -245,6 +245,68 @@ def tiff(pixels: NDArray[Any], extra: Tags | None = None, **options: Any) -> byt
     )
 
 
+def packed(content: bytes, row_bytes: int, compression: int) -> bytes:
+    """Bytes as a strip of a TIFF: 1 as they are, 5 by LZW, 8 by Deflate, 32773 by PackBits."""
+    if compression == 1:
+        return content
+    if compression == 8:
+        return zlib.compress(content)
+    name = {5: "tiff_lzw", 32773: "packbits"}[compression]
+    file = io.BytesIO()
+    grey = Image.frombytes("L", (row_bytes, len(content) // row_bytes), content)
+    grey.save(file, "TIFF", compression=name, tiffinfo={278: grey.height})
+    with Image.open(file) as image:
+        ((begin,), (length,)) = image.tag_v2[273], image.tag_v2[279]  # type: ignore[attr-defined]
+    return file.getvalue()[begin : begin + length]
+
+
+def deep_tiff(
+    pixels: NDArray[np.uint16],
+    *,
+    order: str = "<",
+    compression: int = 1,
+    predictor: bool = False,
+    planar: bool = False,
+    tile: tuple[int, int] | None = None,
+    rows_per_strip: int = 7,
+) -> bytes:
+    """A TIFF of RGB of 16 bits [H, W, 3] in one of the layouts that the format has."""
+    file = TiffFile(order)
+    height, width = pixels.shape[:2]
+    block_height, block_width = tile or (rows_per_strip, width)
+    places, sizes = [], []
+    for plane in np.moveaxis(pixels, 2, 0)[..., None] if planar else [pixels]:
+        for top in range(0, height, block_height):
+            for left in range(0, width, block_width):
+                block = plane[top : top + block_height, left : left + block_width]
+                if tile:
+                    missing = [(0, n - m) for n, m in zip(tile, block.shape[:2], strict=True)]
+                    block = np.pad(block, [*missing, (0, 0)])
+                if predictor:
+                    block = np.diff(block, axis=1, prepend=np.zeros_like(block[:, :1]))
+                row_bytes = 2 * block[0].size
+                content = block.astype(f"{order}u2").tobytes()
+                strip = packed(content, row_bytes, compression)
+                places.append(file.add(strip))
+                sizes.append(len(strip))
+    if tile:
+        blocks = {322: (4, [tile[1]]), 323: (4, [tile[0]]), 324: (4, places), 325: (4, sizes)}
+    else:
+        blocks = {273: (4, places), 278: (4, [rows_per_strip]), 279: (4, sizes)}
+    tags: Tags = {
+        256: (4, [width]),
+        257: (4, [height]),
+        258: (3, [16] * 3),
+        259: (3, [compression]),
+        262: (3, [2]),
+        277: (3, [3]),
+        284: (3, [2 if planar else 1]),
+        317: (3, [2 if predictor else 1]),
+        **blocks,
+    }
+    return file.begin_with(file.add_directory(tags))
+
+
 def jpeg(pixels: NDArray[Any], **options: Any) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", **{"quality": 95, "subsampling": 0, **options})

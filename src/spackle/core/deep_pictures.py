@@ -1,7 +1,8 @@
 """Pictures with 10, 12 or 16 bits a channel, of which Pillow keeps 8.
 
-`read_deep_codes` is the entry. HEIF is decoded by pillow-heif, and AVIF, PNG and TIFF by FFmpeg's
-decoders. 8 bits are too few for HDR and for linear light, where a step of one is visible.
+`read_deep_codes` is the entry. HEIF is decoded by pillow-heif, AVIF and PNG by FFmpeg's decoders,
+and TIFF by `deep_tiffs.py`. 8 bits are too few for HDR and for linear light, where a step of one is
+visible.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from spackle.core.deep_tiffs import read_deep_tiff
 from spackle.core.heif_items import GRID, HeifItems
 from spackle.core.image_formats import AVIF, HEIF, PNG, TIFF, FileKind
 from spackle.core.tiff_directories import ORIENTATION, SIDEWAYS_ORIENTATIONS
@@ -64,9 +66,9 @@ def read_deep_codes(
     elif kind is AVIF:
         codes = _decode_avif(file, max_pixels)
     elif kind is PNG and _is_deep_png(file):
-        codes = _decode_whole_file("png", file, max_pixels)
-    elif kind is TIFF and _is_deep_tiff(image):
-        codes = _decode_whole_file("tiff", file, max_pixels)
+        codes = _decode_png(file, max_pixels)
+    elif kind is TIFF:
+        codes = read_deep_tiff(file)
     if codes is None:
         return None
     height, width = codes.shape[:2]
@@ -289,7 +291,7 @@ def _enlarged(plane: NDArray[np.float32], height: int, width: int) -> NDArray[np
     return result
 
 
-# --- PNG and TIFF
+# --- PNG
 
 
 def _is_deep_png(file: BinaryIO) -> bool:
@@ -300,19 +302,10 @@ def _is_deep_png(file: BinaryIO) -> bool:
     return len(head) == 2 and head[0] == 16 and head[1] in (2, 4, 6)
 
 
-def _is_deep_tiff(image: Image.Image) -> bool:
-    """Whether a TIFF has RGB of 16 bits, of which Pillow keeps 8."""
-    bits = image.tag_v2.get(258, ()) if hasattr(image, "tag_v2") else ()
-    return image.mode in ("RGB", "RGBA") and len(bits) >= 3 and set(bits) == {16}
-
-
-def _decode_whole_file(decoder: str, file: BinaryIO, max_pixels: int) -> Codes:
-    """[H, W, 3 or 4] of a file with 16 bits a channel, which a decoder of FFmpeg reads as a whole.
-
-    ValueError if the decoder gives another layout.
-    """
+def _decode_png(file: BinaryIO, max_pixels: int) -> Codes:
+    """[H, W, 3 or 4] of a PNG with 16 bits a channel; ValueError if it has another layout."""
     file.seek(0)
-    frame = _decode(decoder, file.read(), max_pixels)
+    frame = _decode("png", file.read(), max_pixels)
     name = frame.format.name
     if name.startswith("ya16"):  # grey and transparency
         grey_and_alpha = _interleaved(frame, 2, name)

@@ -155,6 +155,11 @@ def _read_picture(path: str | os.PathLike[str], read: Callable[[OpenPicture], T]
         except Image.DecompressionBombError:
             raise InputError(f"{path}: more than 100 megapixels: shrink the image first") from None
         except UnidentifiedImageError:
+            if kind is TIFF:
+                raise InputError(
+                    f"{path}: a TIFF of a layout that is not read, such as 32 bits per channel, or "
+                    "damaged: save it as RGB with 8 or 16 bits per channel"
+                ) from None
             raise InputError(
                 f"{path}: not an image of a known format, or damaged at its beginning: "
                 f"{EXPORT_ADVICE}"
