@@ -17,9 +17,10 @@ from urllib.parse import urlsplit
 
 import pytest
 from helpers.command import Run, refuses, report_of, run
+from helpers.foreign_scenes import khr_gltf, sog
 from helpers.photos import write_pair, write_photo
 from helpers.portraits import PORTRAIT
-from helpers.scenes import box_before_wall
+from helpers.scenes import box_before_wall, random_gaussians
 from helpers.systems import needs_posix_signals
 from helpers.web_client import PATIENCE_S, SCENES, Served, eventually
 
@@ -98,6 +99,26 @@ def test_a_scene_keeps_its_parts_and_its_camera(tmp_path: Path, visit: Callable[
     )  # open to the network
     assert counts(seen[1]) == {"base": count, "aux": 0}
     assert seen[1]["camera"]["K"][0] == pytest.approx([640, 0, 640])
+
+
+@pytest.mark.parametrize("given", ["folder", "meta.json", "scene.glb"])
+def test_a_scene_of_another_program_is_shown_with_what_it_lost(
+    given: str, tmp_path: Path, visit: Callable[..., Run]
+) -> None:
+    folder = tmp_path / "garden"
+    folder.mkdir()
+    gaussians = random_gaussians(30)
+    for name, content in sog(gaussians, 2, bands=3).items():
+        (folder / name).write_bytes(content)
+    (folder / "scene.glb").write_bytes(khr_gltf(gaussians).glb())
+    seen: list[Any] = []
+    target = folder if given == "folder" else folder / given
+    result = visit(lambda server, id: seen.append(page_of(server, id)), target)
+    assert counts(seen[0]) == {"base": 30, "aux": 0}
+    lost = "" if given == "scene.glb" else "harmonics of degree 3 are dropped"
+    assert lost in seen[0]["note"]
+    assert lost in result.out + result.err
+    assert seen[0]["name"] == ("scene" if given == "scene.glb" else "garden")
 
 
 def test_a_photo_is_completed_as_predict_completes_it(
