@@ -252,4 +252,4 @@ def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
     ]
     assert [line["gaussians"] for line in files] == [report["merged"]] * 2
     listed = run("weights", "list", "--json").out.splitlines()
-    assert [json.loads(line)["name"] for line in listed] == ["sharp", "lama", "features", "depth"]
+    assert [json.loads(line)["name"] for line in listed] == list(PUBLISHED_WEIGHTS)

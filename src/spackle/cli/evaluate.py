@@ -85,7 +85,10 @@ def evaluate(
     ] = "opencv",
     features: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npz", help="SqueezeNet's weights, for the metric distance."),
+        typer.Option(
+            metavar="FILE",
+            help="SqueezeNet's weights, for the metric distance, if not downloaded.",
+        ),
     ] = None,
     limit: LimitOption = None,
     download_metrics: Annotated[

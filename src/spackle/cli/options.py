@@ -30,7 +30,7 @@ INPAINTERS = "exemplar, lama, opencv, propainter, or package.module:Class"
 DATASETS = "middlebury, booster, wildrgbd, tanks, eth3d, llff, pairs (your own), or photos alone"
 METHODS = "base, paper-initial, paper, spackle, spackle-scene, initial, dense, inpaint2d, direct-ft"
 METRICS = "clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips"
-WEIGHTS = "depth (MoGe-2), sharp, lama or features"
+WEIGHTS = "depth (MoGe-2), sharp, lama, features or squeezenet"
 
 # The machine.
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]

@@ -46,7 +46,7 @@ from spackle.residual import MIN_AUX_GAUSSIANS, hole_mask
 from spackle.residual.architectures import ARCHITECTURE_KEY, open_residual
 from spackle.runtime.errors import InputError
 from spackle.scene_fill import FillContext
-from spackle.weights import weights_digest
+from spackle.weights import PUBLISHED_WEIGHTS, weights_digest
 
 TABLES = ("tables.md", "tables.tex")
 FLAT = "inpaint2d," if importlib.util.find_spec("cv2") else ""  # an optional package
@@ -384,6 +384,25 @@ def test_large_views_from_files_to_tables(
     assert all(word in text for word in ("(6 NaN)", "3/23", "PolyForm Noncommercial"))
 
 
+def test_the_distance_takes_downloaded_weights_or_says_how_to_get_them(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
+    options = EvaluateOptions(
+        dataset="middlebury",
+        root=scenes,
+        protocol="near-view",
+        base=BaseSettings(name="rgbd"),
+        metrics=("distance",),
+    )
+    state = open_evaluation(options).metric_states["distance"]
+    assert state.startswith("not run: no weights of SqueezeNet on this machine")
+    assert "`spackle weights get squeezenet` (675.8 kB, BSD)" in state
+    (tmp_path / PUBLISHED_WEIGHTS["squeezenet"].file).write_bytes(b"not a network")
+    with pytest.raises(InputError, match=r"compressed_SqueezeNet\.net: "):
+        open_evaluation(options)
+
+
 def test_metrics_are_added_to_a_finished_run(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -392,7 +411,9 @@ def test_metrics_are_added_to_a_finished_run(
     later = tmp_path / "later"
     monkeypatch.setitem(sys.modules, "pyiqa", None)
     assert evaluate(scenes, later, *words, "--metrics", "ssim,dists").code == 0
-    assert "DISTS not run: pyiqa is not installed" in (later / "tables.md").read_text()
+    text = (later / "tables.md").read_text()
+    assert "DISTS not run: pyiqa is not installed: pip install 'spackle-nvs[eval]'" in text
+    assert "DISTS ↓" not in text
     with monkeypatch.context() as patch:
         fake_pyiqa(patch, lambda name, **options: lambda image, truth: (image - truth).abs().mean())
         assert evaluate(scenes, once, *words, "--metrics", "psnr,ssim,dists").code == 0

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from rich.filesize import decimal
+
 import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.depth import RgbdBase
@@ -36,7 +38,12 @@ from spackle.runtime.device import pick_dtype
 from spackle.runtime.digests import json_digest
 from spackle.runtime.plugins import plugin_digests
 from spackle.scene_fill import FillContext
-from spackle.weights import weights_digest, weights_digests
+from spackle.weights import (
+    PUBLISHED_WEIGHTS,
+    installed_weights,
+    weights_digest,
+    weights_digests,
+)
 
 OWN_METRIC = "own"  # how a metric is measured that no other package measures
 
@@ -179,19 +186,24 @@ def _open_metrics(
 
     # The metric "distance" compares features: what a network (SqueezeNet) finds in two pictures.
     features = None
-    if options.features is not None:
-        features = load_features("squeezenet", options.features)
+    features_file = options.features or installed_weights("squeezenet")
+    if features_file is not None:
+        features = load_features("squeezenet", features_file)
 
     published, published_states = open_published_metrics(
         published_names, options.device.type, options.download_metrics
     )
     states = dict.fromkeys(names, OWN_METRIC) | published_states
-    # The weights of the features' network have to be given; without them there is no distance.
+    # Without the weights of the features' network there is no distance.
     if "distance" in names:
-        if options.features is None:
-            states["distance"] = f"{NOT_RUN}: weights: give SqueezeNet's with `features` FILE"
+        if features_file is None:
+            states["distance"] = (
+                f"{NOT_RUN}: no weights of SqueezeNet on this machine: `spackle weights get "
+                f"squeezenet` ({decimal(PUBLISHED_WEIGHTS['squeezenet'].bytes)}, BSD) downloads "
+                "them, `features` FILE takes a local copy"
+            )
         else:
-            digest_start = weights_digest(options.features)[:16]
+            digest_start = weights_digest(features_file)[:16]
             states["distance"] = f"{OWN_METRIC}, weights {digest_start}"
     return MetricSuite(names, published, features), states
 

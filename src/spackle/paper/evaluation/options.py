@@ -64,7 +64,8 @@ class EvaluateOptions:
     # in all cells; None: those of `residual`.
     dense_residual: Path | None = None
     inpainter: str = "opencv"  # of the method inpaint2d
-    features: Path | None = None  # SqueezeNet's weights, for the metric distance
+    # SqueezeNet's weights, for the metric distance; None: the downloaded ones, if any.
+    features: Path | None = None
     # Which second photos of a case near views use; "auto" is the dataset's own choice.
     second_views: SecondViews | Literal["auto"] = "auto"
     # Long side of the views, in pixels; None: the paper's, 1280 for large views, 1536 for near

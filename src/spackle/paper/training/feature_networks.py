@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from spackle.paper.training.deep_compression import read_deep_compression
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.weights.checkpoints import load_strict, read_tensors
@@ -23,9 +24,12 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 # Mean of the blue, green and red of ImageNet's photos, 0..255, as in Caffe.
 CAFFE_MEAN_BGR = (104.0, 117.0, 123.0)
+# The names of the published weights, by the network's name.
+PUBLISHED_FEATURES = {"resnet50": "features", "squeezenet": "squeezenet"}
 # ResNet-50's four layers: input channels and inner channels of the first block, and number of
 # blocks.
 RESNET50_LAYERS = ((64, 64, 3), (256, 128, 4), (512, 256, 6), (1024, 512, 3))
+SQUEEZENET_LAYERS = 26  # convolutions, with that of the classifier
 # SqueezeNet's blocks by the number in their names: input channels and squeezed channels.
 SQUEEZENET_BLOCKS = {
     2: (96, 16),
@@ -181,8 +185,9 @@ def load_features(
 
     Args:
         name: which network.
-        path: torchvision's .pth file of ResNet-50, or an .npz of SqueezeNet 1.0 with the names of
-            Caffe: `conv1.w`, `conv1.b`, `fire2/conv1x1_1.w`, ...
+        path: torchvision's .pth file of ResNet-50; or for SqueezeNet 1.0 the .net file of its
+            authors, or an .npz with the names of Caffe: `conv1.w`, `conv1.b`, `fire2/conv1x1_1.w`,
+            ...
         device: where the network computes.
 
     Raises:
@@ -192,8 +197,9 @@ def load_features(
         return None
     if path is None:
         raise InputError(
-            f"loss.features_path: missing: give the weights of {name}, download the weights of "
-            "resnet50 with `spackle weights get features`, or choose loss.features=none"
+            f"loss.features_path: missing: give the weights of {name} "
+            f"(`spackle weights get {PUBLISHED_FEATURES[name]}` downloads them), or choose "
+            "loss.features=none"
         )
 
     advice = f"give another file with {name}'s weights"
@@ -203,32 +209,43 @@ def load_features(
         tensors = read_tensors(path, advice)
     else:
         network = SqueezeNet()
-        tensors = read_caffe_arrays(path, advice)
+        tensors = read_squeezenet(path, advice)
     # The classifier at the end of the network, its head, is not needed.
     tensors = {name: value for name, value in tensors.items() if not name.startswith(network.head)}
     return load_strict(network, tensors, path, advice).to(device)
 
 
-def read_caffe_arrays(path: Path, advice: str) -> dict[str, Tensor]:
-    """The arrays of an .npz with Caffe's names, under torch's names.
+def read_squeezenet(path: Path, advice: str) -> dict[str, Tensor]:
+    """SqueezeNet's weights from its authors' .net file, or an .npz, under torch's names.
 
     `fire2/conv1x1_1.w`, for example, becomes `fire2.conv1x1_1.weight`.
 
     InputError if the file is missing or holds no such arrays; the message ends with `advice`.
     """
     check_file(path, "weight file")
+    if path.suffix.lower() == ".net":
+        layers = {
+            name.removesuffix(".weight"): tuple(tensor.shape)
+            for name, tensor in SqueezeNet().state_dict().items()
+            if name.endswith(".weight")
+        }
+        arrays = read_deep_compression(path, layers, SQUEEZENET_LAYERS, advice)
+    else:
+        with (
+            as_input_error(path, f"not a file of weights ({{reason}}): {advice}"),
+            open(path, "rb") as file,
+            np.load(file, allow_pickle=False) as archive,
+        ):
+            arrays = {name: archive[name] for name in archive.files}
+
     suffixes = {"w": "weight", "b": "bias"}
     tensors = {}
-    with (
-        as_input_error(path, f"not a file of weights ({{reason}}): {advice}"),
-        open(path, "rb") as file,
-        np.load(file, allow_pickle=False) as arrays,
-    ):
-        for caffe_name in arrays.files:
+    with as_input_error(path, f"not a file of weights ({{reason}}): {advice}"):
+        for caffe_name, array in arrays.items():
             # "fire2/conv1x1_1.w" is "fire2.conv1x1_1." and the suffix "w".
             layer_and_dot = caffe_name[:-1].replace("/", ".")
             torch_name = layer_and_dot + suffixes[caffe_name[-1]]
-            tensors[torch_name] = torch.from_numpy(arrays[caffe_name])
+            tensors[torch_name] = torch.from_numpy(array.copy())
     return tensors
 
 
