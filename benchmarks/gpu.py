@@ -103,7 +103,10 @@ def sharp(options: argparse.Namespace, precision: Precision = "fp32") -> tuple[S
 def views() -> tuple[Gaussians, list[Camera]]:
     """A scene of SHARP's size, the photo's camera, and a camera to its side."""
     scene, camera = photo_scene()
-    return scene, [camera, leftmost_and_rightmost(camera, 0.3, DepthRange.of(scene))[1]]
+    return scene, [
+        camera,
+        leftmost_and_rightmost(camera, 0.3, DepthRange.of(scene, is_metric=True))[1],
+    ]
 
 
 def rows(tasks: dict[str, TimedTask], runs: int = RUNS) -> Iterator[str]:

@@ -67,7 +67,7 @@ from spackle.bases.lite import MAX_DEPTH_RATIO
 from spackle.core.filters import maximum_filter
 from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.photo import load_photo, resize_photo
-from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
+from spackle.core.trajectories import leftmost_and_rightmost
 from spackle.depth.depth_map import DepthMap
 from spackle.depth.units import RELATIVE_NEAR_M, near_inverse_depth
 from spackle.lifting.edges import Edges
@@ -432,7 +432,7 @@ def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
                 else ([scene.base, scene.aux],)
             )
             ends = leftmost_and_rightmost(
-                scene.camera.even(), scene.disparity or 0.0, DepthRange.of(scene.base)
+                scene.camera.even(), scene.disparity or 0.0, scene.depth_range
             )
             pictures.append([[RENDERER.render(part, end).rgb for part in sets] for end in ends])
         ordered = [

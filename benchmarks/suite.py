@@ -39,7 +39,7 @@ from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
-from spackle.core.trajectories import DepthRange, trajectory_cameras
+from spackle.core.trajectories import trajectory_cameras
 from spackle.formats import save_ply
 from spackle.paper.evaluation.bench import (
     COMPLETION_STAGES,
@@ -226,7 +226,7 @@ def video_section(
     and included in both. There are at most `VIDEO_RUNS` runs.
     """
     prediction, aux = lift(), Gaussians.empty()
-    depths = DepthRange.of(prediction.gaussians)
+    depths = prediction.depth_range
     path = trajectory_cameras("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
     context = FillContext.of(prediction, renderer, network)
 

@@ -117,7 +117,7 @@ def find_view(
     Raises:
         InputError: there is no such view.
     """
-    even, depths = camera.even(), DepthRange.of(base)
+    even, depths = camera.even(), DepthRange.of(base, is_metric=True)
     low, high = 0.0, MAX_DISPARITY
     for _ in range(HALVINGS):
         middle = (low + high) / 2

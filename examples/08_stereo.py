@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import spackle
-from spackle.core.trajectories import DepthRange
 from spackle.formats import save_png
 from spackle.video.stereo import Stereo, default_ipd
 
@@ -15,7 +14,7 @@ from spackle.video.stereo import Stereo, default_ipd
 def main(file: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     scene = spackle.Scene.load(file)
-    depth = DepthRange.of(scene.base)
+    depth = scene.depth_range
     ipd = default_ipd(scene.camera, depth)  # metres; 0.065 if the nearest surface is 1.8 m away
 
     scene.save_video(

@@ -47,7 +47,7 @@ def path_of(
     subject: FillContext, kind: str, disparity: float = 0.3, frames: int = 4
 ) -> list[Camera]:
     return trajectory_cameras(
-        kind, subject.photo_camera, disparity, DepthRange.of(subject.base), frames
+        kind, subject.photo_camera, disparity, DepthRange.of(subject.base, is_metric=True), frames
     )  # type: ignore[arg-type]
 
 

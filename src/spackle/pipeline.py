@@ -238,6 +238,7 @@ class Pipeline:
             camera=prediction.camera,
             by_view=filled.by_view,
             disparity=self._path_disparity(prediction),
+            is_metric=prediction.is_metric,
         )
 
         with reporter.stage("measure"):
@@ -531,7 +532,13 @@ def complete(
         focal_source=prediction.lens_source or None,
         seconds={"complete": round(time.perf_counter() - start, 3)},
     )
-    return Scene(prediction.gaussians, filled.aux, prediction.camera, report=report)
+    return Scene(
+        prediction.gaussians,
+        filled.aux,
+        prediction.camera,
+        report=report,
+        is_metric=prediction.is_metric,
+    )
 
 
 def resolve_texture(fill: str) -> str:

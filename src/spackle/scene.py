@@ -97,6 +97,7 @@ class Scene:
     by_view: tuple[Gaussians, ...] | None = None
     disparity: float | None = None  # the camera's movement for which the scene was completed
     report: SceneReport | None = None  # how it was made; None for a scene from a file
+    is_metric: bool = False  # whether the unit of length is known to be the metre
 
     def __repr__(self) -> str:
         size = f"{self.camera.width}×{self.camera.height}"
@@ -147,12 +148,20 @@ class Scene:
         base_count = len(gaussians) if file.base_count is None else file.base_count
         base = gaussians.select(slice(0, base_count))
         aux = gaussians.select(slice(base_count, None))
-        return Scene(base, aux, camera, disparity=file.disparity)
+        return Scene(base, aux, camera, disparity=file.disparity, is_metric=file.is_metric)
 
     @property
     def gaussians(self) -> Gaussians:
         """All Gaussians, the base's first."""
         return Gaussians.cat([self.base, self.aux])
+
+    @property
+    def depth_range(self) -> DepthRange:
+        """The depths on which a camera path depends; ValueError if nothing is before the camera.
+
+        They are the base's, not those of the aux Gaussians, as when the scene was completed.
+        """
+        return DepthRange.of(self.base, is_metric=self.is_metric)
 
     def of_view(self, index: int) -> list[Gaussians]:
         """The sets of Gaussians from which a completed view is rendered: the base's and the aux.
@@ -182,11 +191,9 @@ class Scene:
         if disparity is None:
             disparity = DEFAULT_MAX_DISPARITY
 
-        # Even sides, because most video formats need them. The base's depths, not those of the aux
-        # Gaussians, set the length of the path, as when the scene was completed.
-        depth_range = DepthRange.of(self.base)
+        # Even sides, because most video formats need them.
         return trajectory_cameras(
-            trajectory, self.camera.even(), disparity, depth_range, frames, looped
+            trajectory, self.camera.even(), disparity, self.depth_range, frames, looped
         )
 
     def along(self, keyframes: KeyframePath, frames: int | None = None) -> list[Camera]:
@@ -201,7 +208,7 @@ class Scene:
                 or look straight up or down.
         """
         frame_count = frames or keyframes.frame_count(KEYFRAMES_FPS)
-        return keyframes.cameras(self.camera.even(), frame_count, DepthRange.of(self.base))
+        return keyframes.cameras(self.camera.even(), frame_count, self.depth_range)
 
     def render(self, camera: Camera, renderer: Renderer | None = None) -> Rendering:
         """Render one view of the whole scene."""
@@ -243,7 +250,15 @@ class Scene:
 
         `name` is the title on the page, `note` a line for the user below it.
         """
-        return page_scene(name, self.base, self.aux, self.camera, self.disparity, note)
+        return page_scene(
+            name,
+            self.base,
+            self.aux,
+            self.camera,
+            self.disparity,
+            note,
+            is_metric=self.is_metric,
+        )
 
     def export(self, target: PathOrFile, format: str | None = None) -> None:
         """Write a file for other viewers.
@@ -284,6 +299,7 @@ class Scene:
             camera=self.camera,
             base_count=len(self.base),
             disparity=self.disparity,
+            is_metric=self.is_metric,
         )
         return encode(content)
 
@@ -416,9 +432,11 @@ class Scene:
         path.check()
 
         cameras = path.video_cameras(
-            self.base, self.camera, keyframes=None, disparity=self.disparity
+            self.depth_range, self.camera, keyframes=None, disparity=self.disparity
         )
-        frame_maker = FrameMaker.of(video, self.base, cameras, name_in_messages)
+        frame_maker = FrameMaker.of(
+            video, self.base, cameras, name_in_messages, is_metric=self.is_metric
+        )
         used_renderer = renderer or get_renderer()
 
         # A frame shows the scene; for a comparison, the base alone to the left of it.

@@ -17,7 +17,6 @@ import torch
 from spackle.bases import DEFAULT_MAX_DISPARITY, BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
-from spackle.core.gaussians import Gaussians
 from spackle.core.keyframes import KeyframePath, PathError
 from spackle.core.photo import Photo, working_size
 from spackle.core.trajectories import (
@@ -136,7 +135,7 @@ class PathOptions:
 
     def video_cameras(
         self,
-        gaussians: Gaussians,
+        depth_range: DepthRange,
         camera: Camera,
         keyframes: KeyframePath | None,
         disparity: float | None,
@@ -146,7 +145,7 @@ class PathOptions:
         Views of odd width or height grow by one pixel, because video needs even sides.
 
         Args:
-            gaussians: the scene; the nearer it is, the shorter the trajectory.
+            depth_range: the scene's depths; the nearer it is, the shorter the trajectory.
             camera: the photo's camera.
             keyframes: the keyframes of `path`; None: follow the trajectory.
             disparity: size of the camera's movement if the option `disparity` is not given; None:
@@ -158,7 +157,7 @@ class PathOptions:
         """
         # Keyframes say themselves where the camera goes.
         if keyframes is not None:
-            return self._keyframe_cameras(gaussians, camera, keyframes)
+            return self._keyframe_cameras(depth_range, camera, keyframes)
 
         frame_count = self.requested_frame_count()
         if frame_count is None:
@@ -168,7 +167,7 @@ class PathOptions:
             self.trajectory,
             camera.even(),
             self.disparity_or(default_disparity),
-            DepthRange.of(gaussians),
+            depth_range,
             frame_count,
             looped=True,  # most players repeat a video
         )
@@ -176,7 +175,7 @@ class PathOptions:
         return [view.zoomed(1 + self.overscan) for view in cameras]
 
     def _keyframe_cameras(
-        self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath
+        self, depth_range: DepthRange, camera: Camera, keyframes: KeyframePath
     ) -> list[Camera]:
         """The cameras of a video through keyframes; PathError if they would be too many."""
         frame_count = self.requested_frame_count()
@@ -187,7 +186,7 @@ class PathOptions:
                 f"{keyframes.seconds:g} s take {frame_count} frames (at most {MAX_FRAME_COUNT}): "
                 "give `frames`"
             )
-        return keyframes.cameras(camera.even(), frame_count, DepthRange.of(gaussians))
+        return keyframes.cameras(camera.even(), frame_count, depth_range)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -299,7 +298,7 @@ def choose_disparity(
     usual_disparity = prediction.max_disparity
     hole_limit = prediction.max_hole_ratio
     with as_input_error(source, NO_PATH_MESSAGE, ValueError):
-        depth_range = DepthRange.of(prediction.gaussians)
+        depth_range = prediction.depth_range
     coarse_camera = prediction.camera.resized(
         *working_size(prediction.camera.width, prediction.camera.height, COARSE_SIDE_PX)
     )
@@ -437,7 +436,13 @@ def plan_views(
             else:
                 path_views = _keyframe_views(prediction, path, keyframes)
 
-    frame_maker = FrameMaker.of(path.video, prediction.gaussians, path_views.frame_cameras, source)
+    frame_maker = FrameMaker.of(
+        path.video,
+        prediction.gaussians,
+        path_views.frame_cameras,
+        source,
+        is_metric=prediction.is_metric,
+    )
     return _index_views(path_views, frame_maker, given_views or [])
 
 
@@ -447,14 +452,14 @@ def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathVie
     ValueError if the scene allows no such path.
     """
     frame_cameras = path.video_cameras(
-        prediction.gaussians,
+        prediction.depth_range,
         prediction.camera,
         keyframes=None,
         disparity=prediction.max_disparity,
     )
     camera = prediction.camera.even()
     disparity = path.disparity_or(prediction.max_disparity)
-    depth_range = DepthRange.of(prediction.gaussians)
+    depth_range = prediction.depth_range
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
     # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other
@@ -483,12 +488,12 @@ def _keyframe_views(
     PathError if the keyframes give no path; ValueError if the scene allows none.
     """
     frame_cameras = path.video_cameras(
-        prediction.gaussians, prediction.camera, keyframes, prediction.max_disparity
+        prediction.depth_range, prediction.camera, keyframes, prediction.max_disparity
     )
     key_cameras = keyframes.at(
         [key.time for key in keyframes.keys],
         prediction.camera.even(),
-        DepthRange.of(prediction.gaussians),
+        prediction.depth_range,
     )
     key_step = math.ceil(len(key_cameras) / MAX_REPORTED_KEYFRAMES)
     reported_keys = range(0, len(key_cameras), key_step)

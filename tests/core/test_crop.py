@@ -51,7 +51,9 @@ def test_crops_give_the_deltas_of_the_whole_view() -> None:
     scene = Scene(texture(96, 640), depth, Camera.from_focal(500, 640, 96))
     base = scene.base()
     view = view_of(
-        base, leftmost_and_rightmost(scene.camera, 0.1, DepthRange.of(base))[1], scene.camera
+        base,
+        leftmost_and_rightmost(scene.camera, 0.1, DepthRange.of(base, is_metric=True))[1],
+        scene.camera,
     )
     mask = view.mask
     one = view.deltas(shipped(), "fp32", cells=torch.ones_like(view.mask))

@@ -136,8 +136,15 @@ def test_depth_range_is_quantiles_with_a_least_focus_depth() -> None:
     assert [found.near, found.focus] == pytest.approx(
         np.quantile(depths.double().numpy(), [0.001, 0.1])
     )
-    found = DepthRange.of(points_of(torch.linspace(0.5, 1.5, 101)))
+    close = points_of(torch.linspace(0.5, 1.5, 101))
+    found = DepthRange.of(close, is_metric=True)
     assert (found.near, found.focus) == (pytest.approx(0.501, abs=1e-6), 2.0)
+    # Where the unit is not known, 2 may be anything, and no depth is special.
+    found = DepthRange.of(close)
+    assert (found.near, found.focus) == pytest.approx((0.501, 0.6))
+    for size in (2.0**-10, 2.0**10):
+        scaled = dataclasses.replace(close, means=close.means * size)
+        assert DepthRange.of(scaled) == DepthRange(found.near * size, found.focus * size)
     with pytest.raises(ValueError, match="in front"):
         DepthRange.of(points_of(torch.tensor([-1.0, 0.0])))
 
@@ -217,7 +224,9 @@ def test_choose_disparity_finds_the_largest_disparity_within_the_limit(
     gaussians, renderer = prediction.gaussians, CpuRenderer()
 
     def uncovered(disparity: float) -> float:
-        ends = leftmost_and_rightmost(scene.camera, disparity, DepthRange.of(gaussians))
+        ends = leftmost_and_rightmost(
+            scene.camera, disparity, DepthRange.of(gaussians, is_metric=True)
+        )
         return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / 2
 
     chosen = choose_disparity(prediction, renderer, photo)

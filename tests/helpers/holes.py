@@ -38,9 +38,9 @@ def box_view(
     """A box before a wall, and a camera from which the wall behind the box is a hole."""
     scene = box_before_wall(width=width, height=height, focal=width * 80 // 96)
     context = FillContext(scene.base(), scene.camera, CPU)
-    return context, leftmost_and_rightmost(scene.camera, disparity, DepthRange.of(context.base))[
-        side
-    ]
+    return context, leftmost_and_rightmost(
+        scene.camera, disparity, DepthRange.of(context.base, is_metric=True)
+    )[side]
 
 
 def view_of(

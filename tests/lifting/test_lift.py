@@ -149,7 +149,7 @@ def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: i
     scene = box_before_wall(near, far)
     base = scene.lift(TILE_LEVELS).gaussians
     camera = leftmost_and_rightmost(
-        scene.camera, disparity, DepthRange.of(scene.lift(levels=0).gaussians)
+        scene.camera, disparity, DepthRange.of(scene.lift(levels=0).gaussians, is_metric=True)
     )[side]
     box = box_mask(96, 72)
 
@@ -176,7 +176,9 @@ def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: i
 def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
     scene = slanted_plane(1.5, 6, axis)
     base = scene.lift(TILE_LEVELS).gaussians
-    for camera in trajectory_cameras(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]
+    for camera in trajectory_cameras(
+        kind, scene.camera, 0.5, DepthRange.of(base, is_metric=True), frames=9
+    ):  # type: ignore[arg-type]
         interior = shows_plane(scene, camera)
         assert int(interior.sum()) > 1000
         assert int(hole_mask(CPU.render(base, camera).alpha)[interior].sum()) == 0
@@ -196,7 +198,7 @@ def test_rounded_disparities_leave_no_stairs() -> None:
         (stored - 1 / scene.depth).square().mean(),
     )
     assert float(error) < 0.25 * float(before)
-    for camera in leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base)):
+    for camera in leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base, is_metric=True)):
         holes = hole_mask(CPU.render(base, camera).alpha)[shows_plane(scene, camera)]
         assert float(holes.float().mean()) < 0.002
 

@@ -132,7 +132,7 @@ def test_no_grid_is_visible_between_tiles_of_several_sizes(slant: float, rise: f
     away = max_pool2d(speck[None, None].float(), 7, 1, 3)[0, 0] == 0
     assert float((own.rgb - photo).abs().amax(-1)[away].max()) < (1.0 if rise == 0 else 1.5) / 255
     if rise == 0:
-        for view in leftmost_and_rightmost(camera, 0.3, DepthRange.of(base)):
+        for view in leftmost_and_rightmost(camera, 0.3, DepthRange.of(base, is_metric=True)):
             seen = CPU.render(base, view)
             inner = max_pool2d((seen.alpha < 0.9)[None, None].float(), 9, 1, 4)[0, 0] == 0
             off = (seen.rgb - 0.3).abs().amax(-1)[inner]

@@ -86,7 +86,7 @@ def wall_beside(scene: Scene) -> list[Tensor]:
     assert psnr(CPU.render(base, scene.camera).rgb, scene.rgb) > 32
     views = [
         CPU.render(base, view)
-        for view in leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base))
+        for view in leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base, is_metric=True))
     ]
     return [seen.rgb[(seen.depth > 5) & (seen.alpha > 0.95)] for seen in views]
 

@@ -96,7 +96,7 @@ def paper(
 def test_a_completed_view_matches_the_equations(size: tuple[int, int]) -> None:
     scene = box_before_wall(width=size[0], height=size[1], focal=40)
     base, network = scene.base(), random_network()
-    camera = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base))[1]
+    camera = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base, is_metric=True))[1]
     aux = complete_view(base, camera, scene.camera, CPU, network, precision="fp32")
     with torch.no_grad():
         expected, final = paper(base, camera, scene.camera, network)

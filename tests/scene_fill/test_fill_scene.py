@@ -55,7 +55,7 @@ def path_of(
     frames: int = FRAMES,
 ) -> list[Camera]:
     return trajectory_cameras(
-        kind, context.photo_camera, disparity, DepthRange.of(context.base), frames
+        kind, context.photo_camera, disparity, DepthRange.of(context.base, is_metric=True), frames
     )
 
 
@@ -182,7 +182,7 @@ def test_an_underlay_is_not_visible_in_the_opposite_view(monkeypatch: pytest.Mon
     pole[:, 44:54] = True
     scene = dataclasses.replace(scene, depth=torch.where(pole, 2.0, 6.0))
     context = FillContext(scene.base(), scene.camera, CPU)
-    sides = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(context.base))
+    sides = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(context.base, is_metric=True))
     aux = fill_scene(context, sides, exact=True).aux
     assert int((aux.colors == green).all(-1).sum()) > 20
     shown = [CPU.render([context.base, aux], camera).rgb for camera in sides]
@@ -194,7 +194,9 @@ def test_an_underlay_is_not_visible_in_the_opposite_view(monkeypatch: pytest.Mon
 
 def test_an_underlay_is_not_visible_beyond_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
     context, _ = box_view()
-    sides = leftmost_and_rightmost(context.photo_camera, 0.6, DepthRange.of(context.base))
+    sides = leftmost_and_rightmost(
+        context.photo_camera, 0.6, DepthRange.of(context.base, is_metric=True)
+    )
     aux = fill_scene(context, sides, exact=True).aux
     monkeypatch.setattr(fill, "rim_underlay", lambda *given: Gaussians.empty())
     bare = fill_scene(context, sides, exact=True).aux
@@ -220,7 +222,8 @@ def test_all_frames_are_filled_and_a_view_that_shows_the_same_is_not_rendered_ag
     context = dataclasses.replace(context, renderer=renderer)
     path = path_of(context, kind, disparity)
     # The command line adds the widest views, too. Players repeat a video, so views come twice.
-    widest = leftmost_and_rightmost(context.photo_camera, disparity, DepthRange.of(context.base))
+    depths = DepthRange.of(context.base, is_metric=True)
+    widest = leftmost_and_rightmost(context.photo_camera, disparity, depths)
     views = [*path, *widest, *path]
     filled = fill_scene(context, views, progress=lambda done, total: calls.append((done, total)))
     assert calls == [(k, len(views)) for k in range(1, len(views) + 1)]
@@ -288,7 +291,9 @@ def test_motorcycle_is_filled_and_visible_pixels_stay() -> None:
     whole = fill_scene(context, path_of(context, "swipe", frames=5)).aux
     for new in (aux, whole):
         assert psnr(CPU.render([context.base, new], found.camera).rgb, photo.rgb) >= 45
-    for camera in leftmost_and_rightmost(found.camera, 0.3, DepthRange.of(context.base)):
+    for camera in leftmost_and_rightmost(
+        found.camera, 0.3, DepthRange.of(context.base, is_metric=True)
+    ):
         assert holes_of(camera, context.base) > 0.2
         assert holes_of(camera, context.base, whole) <= 0.03 * holes_of(camera, context.base)
 

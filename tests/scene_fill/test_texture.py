@@ -85,7 +85,7 @@ def test_painted_textures_are_visible(size: tuple[int, int], threshold: float) -
     assert bool((filled.aux.colors.sum(-1) > 0).all())  # no black cells
     painter.asked.clear()
     path = trajectory_cameras(
-        "rotate-forward", context.photo_camera, 0.4, DepthRange.of(context.base), 9
+        "rotate-forward", context.photo_camera, 0.4, DepthRange.of(context.base, is_metric=True), 9
     )
     assert len(fill_scene(context, path, exact=True).aux)
     assert len(painter.asked) == OPPOSITE_VIEWS  # only the widest views

@@ -98,7 +98,9 @@ def test_depth_colours_are_linear_in_inverse_depth() -> None:
 def test_depth_colours_of_a_video_share_one_scale() -> None:
     scene = box_before_wall(near=2.0, far=6.0)
     base = scene.base()
-    path = trajectory_cameras("rotate-forward", scene.camera, 0.3, DepthRange.of(base), 5)
+    path = trajectory_cameras(
+        "rotate-forward", scene.camera, 0.3, DepthRange.of(base, is_metric=True), 5
+    )
     scale = DepthColorScale.over(base, path)
     assert (scale.near, scale.far) == pytest.approx((2.0, 6.0), rel=0.25)
     film = FrameMaker.of(VideoOptions(show="depth"), base, path, Path("x"))

@@ -29,7 +29,6 @@ from spackle.core.camera import Camera
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     SHARP_TRAJECTORIES,
-    DepthRange,
     TrajectoryKind,
     trajectory_cameras,
 )
@@ -55,7 +54,7 @@ VIEW = ("swipe", 0.3, 1.0)  # far to the right, where there are holes
 def box() -> Scene:
     """A small scene, completed by initial Gaussians."""
     prediction = box_before_wall(width=64, height=48, focal=53).lift()
-    depths = DepthRange.of(prediction.gaussians)
+    depths = prediction.depth_range
     return complete(
         prediction,
         trajectory_cameras("swipe", prediction.camera.even(), 0.35, depths, 4),
@@ -65,7 +64,7 @@ def box() -> Scene:
 
 @functools.cache
 def page_of_box(name: str = "Box") -> PageScene:
-    return page_scene(name, box().base, box().aux, box().camera, 0.35)
+    return page_scene(name, box().base, box().aux, box().camera, 0.35, is_metric=box().is_metric)
 
 
 def test_the_built_page_belongs_to_its_sources() -> None:
@@ -172,7 +171,7 @@ def canvas(page: Any) -> Tensor:
 def camera_of(page: Any, width: int, height: int) -> Camera:
     """A camera of Spackle at the position of the page's camera."""
     eye = torch.tensor(page.evaluate("spackle.pose().eye"))
-    focus = torch.tensor([0.0, 0.0, DepthRange.of(box().base).focus])
+    focus = torch.tensor([0.0, 0.0, box().depth_range.focus])
     return box().camera.resized(width, height).zoomed(1 + DEFAULT_OVERSCAN).looking(eye, focus)
 
 
@@ -207,7 +206,7 @@ def test_the_single_file_opens_from_a_disk_and_asks_nobody(shown: Opened) -> Non
 
 @pytest.mark.parametrize("kind", SHARP_TRAJECTORIES)
 def test_the_page_goes_where_the_trajectory_goes(page: Any, kind: TrajectoryKind) -> None:
-    cameras = trajectory_cameras(kind, box().camera, 0.45, DepthRange.of(box().base), 121)
+    cameras = trajectory_cameras(kind, box().camera, 0.45, box().depth_range, 121)
     places = [0, 17, 60, 61, 103, 120]
     eyes = page.evaluate(
         "([kind, places]) => places.map((k) => spackle.eye(kind, 0.45, k / 120))", [kind, places]

@@ -17,6 +17,7 @@ from spackle.core.camera import Camera
 from spackle.core.focal_length import focal_mm_to_px
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
+from spackle.core.trajectories import DepthRange
 from spackle.runtime.progress import Progress
 
 # The camera's move, as a share of the view that the nearest surface shifts by, if neither the user
@@ -39,6 +40,13 @@ class BasePrediction:
     lens_source: str = ""  # who gave the focal length, if neither the photo's file nor the user did
     max_disparity: float = DEFAULT_MAX_DISPARITY  # largest camera move with correct geometry
     max_hole_ratio: float = DEFAULT_MAX_HOLE_RATIO  # share of the widest views that may be holes
+    is_metric: bool = True  # whether the unit of length is known to be the metre
+
+    @property
+    def depth_range(self) -> DepthRange:
+        """The depths on which a camera path depends; ValueError if nothing is before the camera."""
+        return DepthRange.of(self.gaussians, is_metric=self.is_metric)
+
     # [H, W, 3] sRGB: the photo at the camera's size, which residual networks see (I in eq. 5).
     # None: unknown, as for Gaussians of another tool; a rendering of the Gaussians then stands in.
     photo: Tensor | None = dataclasses.field(default=None, repr=False, compare=False)

@@ -55,7 +55,10 @@ class RgbdBase:
         stretch = self.depth.stretch_to(framed_height, framed_width)
         if abs(stretch) > ASPECT_TOLERANCE:
             notes["depth_stretched"] = round(abs(stretch), 4)
-        return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
+        # A unit that was only guessed decides nothing.
+        return dataclasses.replace(
+            prediction, notes=notes, lens_source=lens_source, is_metric=not depth.is_guess
+        )
 
     def _cropped_to(self, photo: Photo) -> tuple[DepthMap, Camera | None]:
         """The map and its camera, without the border that was cropped from the photo.

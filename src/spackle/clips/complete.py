@@ -210,7 +210,7 @@ class ClipCompleter:
 
         # The camera's path depends on a range of depths. It follows the range of each frame slowly,
         # so that the camera moves smoothly.
-        depth_range = DepthRange.of(base)
+        depth_range = DepthRange.of(base, is_metric=prediction.is_metric)
         if previous is not None:
             depth_range = previous.depth_range.towards(depth_range, DEPTH_RANGE_FOLLOWING)
         state = _FrameState(

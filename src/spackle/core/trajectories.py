@@ -25,7 +25,8 @@ TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
 
 NEAR_QUANTILE = 0.001  # quantile of depth that defines z_near
 FOCUS_QUANTILE = 0.1  # quantile of depth that defines the focus depth
-MIN_FOCUS_M = 2.0  # a nearer focus would turn the camera too much
+# SHARP's rule for scenes in metres: a nearer focus would turn the camera too much.
+MIN_FOCUS_M = 2.0
 MAX_DISPARITY = 2.0  # beyond, the photo is out of view
 # Relative gain in focal length along a path; hides most of the fill beyond the photo's border.
 DEFAULT_OVERSCAN = 0.05
@@ -37,11 +38,17 @@ class DepthRange:
     """The two depths of a scene that a trajectory depends on, in the scene's unit."""
 
     near: float  # z_near, the 0.1 % quantile: nearly the nearest surface
-    focus: float  # the depth that stays in the middle: the 10 % quantile, at least 2 m
+    # The depth that stays in the middle: the 10 % quantile; in a metric scene at least 2 m.
+    focus: float
 
     @staticmethod
-    def of(gaussians: Gaussians) -> DepthRange:
+    def of(gaussians: Gaussians, *, is_metric: bool = False) -> DepthRange:
         """Measure the depths of Gaussians in front of a camera at the world's origin.
+
+        Args:
+            gaussians: the scene.
+            is_metric: whether its unit is known to be the metre. In any other scene, nothing may
+                depend on the unit, so that the camera moves in the same way in every unit.
 
         Raises:
             ValueError: no Gaussian is in front of the camera.
@@ -53,7 +60,8 @@ class DepthRange:
         # Quantiles, because single stray Gaussians are nearer than any surface.
         # Numpy's quantile, because torch's takes at most 16 million values.
         near, focus = np.quantile(z, [NEAR_QUANTILE, FOCUS_QUANTILE])
-        return DepthRange(near=float(near), focus=max(MIN_FOCUS_M, float(focus)))
+        min_focus = MIN_FOCUS_M if is_metric else 0.0
+        return DepthRange(near=float(near), focus=max(min_focus, float(focus)))
 
     def towards(self, other: DepthRange, part: float) -> DepthRange:
         """Interpolate on a logarithmic scale: this range for `part` 0, the other for `part` 1."""

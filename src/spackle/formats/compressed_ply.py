@@ -73,6 +73,7 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
         camera=scene.camera_at_origin,
         base_count=scene.base_count,
         disparity=scene.disparity,
+        is_metric=scene.is_metric,
     )
     return header + chunks.tobytes() + vertices.tobytes()
 

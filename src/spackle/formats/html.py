@@ -76,6 +76,8 @@ def page_scene(
     camera: Camera,
     disparity: float | None = None,
     note: str = "",
+    *,
+    is_metric: bool = False,
 ) -> PageScene:
     """Prepare a scene for the page.
 
@@ -93,6 +95,7 @@ def page_scene(
             page's camera goes no farther. None if it is not known.
         note: a text for the user; empty for none. The page shows the whole text for some seconds,
             and then only its beginning, up to the first semicolon.
+        is_metric: whether the scene's unit is known to be the metre.
 
     Raises:
         InputError: no Gaussian lies in front of the camera.
@@ -101,7 +104,7 @@ def page_scene(
         problem = "no Gaussian lies in front of the photo's camera"
         raise InputError(f"{name}: {problem}: nothing can be shown")
 
-    depths = DepthRange.of(base)
+    depths = DepthRange.of(base, is_metric=is_metric)
     limit = _movement_limit(disparity, is_filled=len(aux) > 0)
     # A scene that Spackle completed is shown enlarged a little, as its videos are, which hides
     # most of what was filled in beyond the photo's border.

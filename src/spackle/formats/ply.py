@@ -66,6 +66,7 @@ def save_ply(
     camera: Camera | None = None,
     base_count: int | None = None,
     disparity: float | None = None,
+    is_metric: bool = False,
 ) -> None:
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
@@ -73,7 +74,7 @@ def save_ply(
     sRGB colour as the coefficient f_dc of the constant spherical harmonic, the opacity as its
     logit, the scales as natural logarithms, and the rotation as a unit quaternion (w, x, y, z).
     A Gaussian gives the same bytes, whatever other Gaussians the scene has. Comments in the
-    header keep `camera`, `base_count` and `disparity`.
+    header keep `camera`, `base_count`, `disparity` and `is_metric`.
 
     Args:
         gaussians: the scene.
@@ -82,13 +83,15 @@ def save_ply(
         base_count: how many Gaussians come from the photo; those that fill holes come after.
         disparity: how far to the side the camera may go, because the holes that it uncovers are
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal.
+        is_metric: whether the unit of length is known to be the metre.
 
     Raises:
         InputError: `path` cannot be written.
         ValueError: a Gaussian is not finite.
     """
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_encode_parts(gaussians, camera, base_count, disparity))
+        parts = _encode_parts(gaussians, camera, base_count, disparity, is_metric)
+        file.writelines(parts)
 
 
 def encode_ply(scene: SceneFile) -> bytes:
@@ -98,13 +101,21 @@ def encode_ply(scene: SceneFile) -> bytes:
         ValueError: a Gaussian is not finite.
     """
     parts = _encode_parts(
-        scene.gaussians, scene.camera_at_origin, scene.base_count, scene.disparity
+        scene.gaussians,
+        scene.camera_at_origin,
+        scene.base_count,
+        scene.disparity,
+        scene.is_metric,
     )
     return b"".join(parts)
 
 
 def _encode_parts(
-    gaussians: Gaussians, camera: Camera | None, base_count: int | None, disparity: float | None
+    gaussians: Gaussians,
+    camera: Camera | None,
+    base_count: int | None,
+    disparity: float | None,
+    is_metric: bool,
 ) -> Iterator[bytes]:
     """Yield the header of a PLY file, and then its rows, ROWS_PER_BLOCK at a time.
 
@@ -115,11 +126,14 @@ def _encode_parts(
         disparity: how far to the side the camera may go, because the holes that it uncovers are
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal. None
             if it is not known.
+        is_metric: whether the unit of length is known to be the metre.
     """
     vertex = NewTable(
         name="vertex", row_count=len(gaussians), type="float", properties=WRITTEN_PROPERTIES
     )
-    yield ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity)
+    yield ply_header(
+        vertex, camera=camera, base_count=base_count, disparity=disparity, is_metric=is_metric
+    )
 
     gaussians = gaussians.detach().to("cpu", torch.float32)
     # All blocks are converted at full size, because the last bits of a result may depend on the
@@ -198,6 +212,7 @@ class PlyFile:
             camera=camera,
             base_count=base_count,
             disparity=disparity,
+            is_metric=self.is_metric(),
             format=self._format(),
             writer=self._tables.generator,
             harmonics_degree=self._harmonics_degree(),
@@ -341,6 +356,15 @@ class PlyFile:
         """
         numbers = self._tables.numbers_in_comment("spackle_disparity", count=1)
         return None if numbers is None else numbers[0]
+
+    def is_metric(self) -> bool:
+        """Whether the file says that its unit of length is the metre.
+
+        Raises:
+            InputError: the comment that says so does not hold a number.
+        """
+        numbers = self._tables.numbers_in_comment("spackle_metric", count=1)
+        return numbers is not None and numbers[0] == 1
 
     def _vertex_element(self) -> PlyElement:
         """Return the table of the vertices, which are the Gaussians.

@@ -65,6 +65,7 @@ def ply_header(
     camera: Camera | None = None,
     base_count: int | None = None,
     disparity: float | None = None,
+    is_metric: bool = False,
 ) -> bytes:
     """Return the header of a binary PLY file, with what Spackle knows of the scene as comments.
 
@@ -74,6 +75,7 @@ def ply_header(
         base_count: how many Gaussians come from the photo; those that fill holes come after.
         disparity: how far to the side the camera may go, because the holes that it uncovers are
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal.
+        is_metric: whether the unit of length is known to be the metre.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     if camera is not None:
@@ -85,6 +87,8 @@ def ply_header(
         lines.append(f"comment spackle_base {base_count!r}")
     if disparity is not None:
         lines.append(f"comment spackle_disparity {disparity!r}")
+    if is_metric:
+        lines.append("comment spackle_metric 1")
 
     for table in tables:
         lines.append(f"element {table.name} {table.row_count}")

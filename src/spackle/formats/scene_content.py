@@ -52,6 +52,8 @@ class SceneFile:
     # How far to the side the camera may go, because the holes that it uncovers are filled. A
     # disparity of 1 shifts the nearest surface by the picture's diagonal.
     disparity: float | None = None
+    # Whether the unit of length is known to be the metre.
+    is_metric: bool = False
     format: str = ""  # with the version, such as "SPZ 3"
     writer: str | None = None  # the program that wrote the file, as the file names it
     # The highest degree of the file's spherical harmonics. Those above degree 0 are not read.

@@ -265,6 +265,7 @@ def _write_files(
                 # The Gaussians after this number are those that completion has added.
                 base_count=len(scene.base),
                 disparity=scene.disparity,
+                is_metric=scene.is_metric,
             )
         if options.depth_out is not None:
             save_depth(scene.depth_map(pipeline.renderer), folder / options.depth_out)

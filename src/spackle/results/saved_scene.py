@@ -245,7 +245,7 @@ def _open_scene_video(
         as_input_error(path.path, "{reason}", PathError),
     ):
         cameras = given.views or path.video_cameras(
-            scene.base, scene.camera, given.keyframes, scene.disparity
+            scene.depth_range, scene.camera, given.keyframes, scene.disparity
         )
 
     _say_if_beyond_completion(scene, scene_file, path, reporter)
@@ -257,7 +257,9 @@ def _open_scene_video(
     return SceneVideo(
         cameras=cameras,
         has_given_views=bool(given.views),
-        frame_maker=FrameMaker.of(path.video, scene.base, cameras, scene_file),
+        frame_maker=FrameMaker.of(
+            path.video, scene.base, cameras, scene_file, is_metric=scene.is_metric
+        ),
         gaussian_sets=gaussian_sets,
         gaussian_count=len(loaded.gaussians),
         renderer=renderer,

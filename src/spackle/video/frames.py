@@ -49,7 +49,12 @@ class FrameMaker:
 
     @staticmethod
     def of(
-        options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path
+        options: VideoOptions,
+        gaussians: Gaussians,
+        cameras: Sequence[Camera],
+        source: Path,
+        *,
+        is_metric: bool = False,
     ) -> FrameMaker:
         """Make a frame maker; what the options leave open follows from the scene and the cameras.
 
@@ -58,6 +63,7 @@ class FrameMaker:
             gaussians: the scene.
             cameras: the views of all frames, of one size.
             source: the file whose name begins messages.
+            is_metric: whether the scene's unit is known to be the metre.
 
         Raises:
             InputError: the video is impossible, or its frames are too large.
@@ -65,7 +71,7 @@ class FrameMaker:
         depth_scale = None
         try:
             # The eyes' distance follows from the first view, and stays the same in all others.
-            stereo = _derive_stereo(options, gaussians, cameras[0])
+            stereo = _derive_stereo(options, gaussians, cameras[0], is_metric)
             if options.show == "depth":
                 depth_scale = DepthColorScale.over(gaussians, cameras)
         except ValueError as error:
@@ -217,7 +223,9 @@ class FrameMaker:
         }
 
 
-def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
+def _derive_stereo(
+    options: VideoOptions, gaussians: Gaussians, camera: Camera, is_metric: bool
+) -> Stereo | None:
     """Return the eyes of a stereo video, or None if the options ask for no stereo.
 
     If the options do not give the distance of the eyes (`ipd`) or the depth that appears at the
@@ -227,6 +235,7 @@ def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) 
         options: what the video looks like.
         gaussians: the scene.
         camera: the first view.
+        is_metric: whether the scene's unit is known to be the metre.
 
     Raises:
         ValueError: the eyes are so far apart that their images have nothing in common.
@@ -236,7 +245,7 @@ def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) 
     ipd = options.ipd
     convergence = options.convergence
     if ipd is None or convergence is None:
-        depths = DepthRange.of(gaussians)
+        depths = DepthRange.of(gaussians, is_metric=is_metric)
         if ipd is None:
             ipd = default_ipd(camera, depths)
         if convergence is None:

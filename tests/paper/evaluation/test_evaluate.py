@@ -25,7 +25,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.settings import BaseSettings
-from spackle.core.trajectories import DepthRange, disparity_to_offset
+from spackle.core.trajectories import disparity_to_offset
 from spackle.paper.evaluation.case import load_case
 from spackle.paper.evaluation.evaluate import methods_of_case
 from spackle.paper.evaluation.evaluation import open_evaluation
@@ -314,7 +314,7 @@ def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
     assert [(view.setting, view.name) for view in views] == [
         (s, n) for s in ("0.3", "0.5") for n in ("left", "right")
     ]
-    reach = DepthRange.of(prediction.gaussians)
+    reach = prediction.depth_range
     for view, sign in zip(views, (-1, 1, -1, 1), strict=True):
         x = sign * disparity_to_offset(views[0].camera, float(view.setting), reach)
         assert view.camera.position.tolist() == pytest.approx([x, 0, 0], rel=1e-5, abs=1e-6)

@@ -22,7 +22,6 @@ from rich.filesize import decimal
 
 from spackle.bases.open import BaseError, open_base
 from spackle.core.photo import load_photo, resize_photo
-from spackle.core.trajectories import DepthRange
 from spackle.paper.dataset.encoding import decode_gaussians, encode_gaussians
 from spackle.paper.dataset.options import DatasetOptions, completion_facts, dataset_configuration
 from spackle.paper.dataset.photos import PhotoFile, choose_photos, find_photos
@@ -131,7 +130,7 @@ class SampleMaker:
             options.trajectory, options.disparity, options.seed, file.sha256
         )
         with as_input_error(file.path, "no camera path: {reason}", ValueError):
-            depth_range = DepthRange.of(prediction.gaussians)
+            depth_range = prediction.depth_range
             photo_camera = prediction.camera.even()  # videos need even sides
             cameras = cameras_along_path(kind, disparity, photo_camera, depth_range, options.views)
         views = render_views(prediction, cameras, self.renderer)

@@ -17,7 +17,7 @@ from torch import Tensor
 from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.photo import working_size
-from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
+from spackle.core.trajectories import leftmost_and_rightmost
 from spackle.paper.evaluation.case import Viewpoint
 from spackle.paper.evaluation.measurements import REMARK_METRIC, Measurement, image_measurement
 from spackle.paper.evaluation.methods import Fill, MethodView
@@ -57,7 +57,7 @@ def large_views(
     camera = prediction.camera
     viewpoints = []
     try:
-        depth_range = DepthRange.of(prediction.gaussians)
+        depth_range = prediction.depth_range
         width, height = working_size(camera.width, camera.height, max_side)
         camera = camera.resized(width, height).even()
 

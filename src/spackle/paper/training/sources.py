@@ -21,7 +21,7 @@ from spackle.bases import BasePrediction
 from spackle.bases.depth import lift_rgbd
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory_cameras
+from spackle.core.trajectories import SHARP_TRAJECTORIES, trajectory_cameras
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.dataset.shards import DatasetFiles
 from spackle.paper.training.composites import draw_composite
@@ -323,7 +323,7 @@ def random_reverse_view(
     # levels=0 gives one Gaussian for each pixel. Larger Gaussians, which join pixels of flat parts,
     # could not be visible in one part and hidden in another.
     prediction = lift_rgbd(rgb, depth, camera, levels=0)
-    depth_range = DepthRange.of(prediction.gaussians)
+    depth_range = prediction.depth_range
     kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     disparity = rng.uniform(*disparity_range)
     path = trajectory_cameras(kind, camera, disparity, depth_range, PATH_FRAMES)
