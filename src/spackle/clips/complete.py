@@ -17,6 +17,7 @@ from spackle.core.trajectories import DepthRange, TrajectoryKind, trajectory_cam
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, hole_mask
+from spackle.residual.features import TINY
 from spackle.runtime.device import Precision
 from spackle.scene_fill import FillContext, OcclusionGuard, fill_view
 
@@ -188,7 +189,7 @@ class ClipCompleter:
         photo_rendering = self.renderer.render(prediction.gaussians, prediction.camera)
         depth = photo_rendering.depth
         known = ~hole_mask(photo_rendering.alpha) & (depth > 0)
-        inverse_depth = torch.where(known, 1 / depth.clamp_min(1e-6), 0.0)  # [H, W]
+        inverse_depth = torch.where(known, 1 / depth.clamp_min(TINY), 0.0)  # [H, W]
 
         previous = self._previous
         alignment = DepthAlignment()

@@ -20,7 +20,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.hole_filling import fill_from_far_side
 from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
-from spackle.residual.features import CELL, hole_mask
+from spackle.residual.features import CELL, TINY, hole_mask
 
 # Factor on the trust in a colour per frame: a colour that was seen lasts over fifty frames.
 TRUST_DECAY = 0.98
@@ -160,7 +160,7 @@ def surfaces_behind_base(
     depth = torch.where(hole & (aux_depth > 0), aux_depth, rendering.depth)
 
     # Where nothing was drawn, the inverse depth must still be positive.
-    inverse_depth = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
+    inverse_depth = torch.where(depth > 0, 1 / depth.clamp_min(TINY), 0.0)
     is_drawn = inverse_depth > 0
     farthest = inverse_depth.new_tensor(1.0)
     if bool(is_drawn.any()):

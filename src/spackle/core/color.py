@@ -35,7 +35,7 @@ MAX_SAMPLED_VIEWS = 60
 # Quantiles of inverse depth at the ends of the scale; beyond are a few stray Gaussians.
 FAR_QUANTILE = 0.002
 NEAR_QUANTILE = 0.998
-MIN_DEPTH_IN_VIEW = 0.01  # in the scene's unit; a nearer Gaussian is behind or in the lens
+MIN_RELATIVE_DEPTH_IN_VIEW = 1e-3  # of the median depth; a nearer Gaussian is in the lens
 
 UNKNOWN_DEPTH_GREY = 0.5  # sRGB of unknown depth; the colour map contains no grey
 # Seventeen evenly spaced colours of matplotlib's inferno (CC0), as sRGB, dark to bright.
@@ -86,9 +86,12 @@ class DepthColorScale:
             known: [H, W] bool.
         """
         # 0 at the far end of the scale, 1 at its near end.
-        span = max(1 / self.near - 1 / self.far, 1e-12)  # positive even for one single depth
-        # The clamp avoids a division by zero where the depth is unknown.
-        brightness = ((1 / depth.clamp_min(1e-6) - 1 / self.far) / span).clamp(0, 1)
+        span = max(
+            1 / self.near - 1 / self.far, 1e-12 / self.near
+        )  # positive even for one single depth
+        # What is nearer than the scale begins is as bright as its beginning. The clamp also avoids
+        # a division by zero where the depth is unknown.
+        brightness = ((1 / depth.clamp_min(self.near) - 1 / self.far) / span).clamp(0, 1)
 
         # Interpolate between the two closest colours of the table.
         table = depth.new_tensor(INFERNO_COLORS)
@@ -106,7 +109,12 @@ def _inverse_depths_in_view(means: Tensor, camera: Camera) -> Tensor:
     uv, z = camera.to("cpu").project(means)
     size = uv.new_tensor([camera.width, camera.height])
     is_in_image = (uv >= 0).all(dim=-1) & (uv < size).all(dim=-1)
-    return 1 / z[(z > MIN_DEPTH_IN_VIEW) & is_in_image]
+    is_in_view = (z > 0) & is_in_image
+    if not bool(is_in_view.any()):
+        return z[is_in_view]
+    # A much nearer Gaussian than the others is in the lens.
+    nearest = MIN_RELATIVE_DEPTH_IN_VIEW * z[is_in_view].median()
+    return 1 / z[is_in_view & (z > nearest)]
 
 
 def to_uint8(image: Tensor) -> Tensor:

@@ -82,6 +82,10 @@ class Gaussians:
         """Select Gaussians by a boolean mask [N], an index tensor [M] or a slice."""
         return Gaussians(*(tensor[index] for tensor in self.tensors))
 
+    def scaled(self, factor: float) -> Gaussians:
+        """The scene in another unit of length: centres and scales times a factor."""
+        return dataclasses.replace(self, means=self.means * factor, scales=self.scales * factor)
+
     def transform(self, matrix: Tensor) -> Gaussians:
         """Apply a similarity [4, 4]: rotation, uniform scale and translation.
 

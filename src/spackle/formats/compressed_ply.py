@@ -19,6 +19,8 @@ from spackle.formats.quantization import (
     decode_smallest_three,
     encode_smallest_three,
     fractions_to_components,
+    near_distance,
+    ordinary_length_factor,
 )
 from spackle.formats.scene_content import SceneFile
 
@@ -29,6 +31,8 @@ MAX_LOG_SCALE = 20
 
 # Bits of each coordinate along Morton's curve; three coordinates fit a word of 32 bits.
 MORTON_BITS = 10
+
+LOG2_DISTANCES_PER_CLASS = 10  # the farthest of a class is a thousand times as far as the nearest
 
 # A range of equal values counts as this wide, so that no fraction divides by zero.
 MIN_SPAN = 1e-30
@@ -83,9 +87,27 @@ def file_order(scene: SceneFile) -> NDArray[np.int64]:
     means = scene.gaussians.means.detach().to("cpu", torch.float32).numpy()
     # If it is not known which Gaussians fill holes, all are sorted together.
     base_count = 0 if scene.base_count is None else scene.base_count
-    base_order = morton_order(means[:base_count])
-    fill_order = base_count + morton_order(means[base_count:])
+    base_order = _spatial_order(means[:base_count])
+    fill_order = base_count + _spatial_order(means[base_count:])
     return np.concatenate([base_order, fill_order])
+
+
+def _spatial_order(means: Floats) -> NDArray[np.int64]:
+    """Return the indices [N] that sort points [N, 3] by distance classes, then by Morton's curve.
+
+    A class reaches from one distance to a thousand times as far, so that most scenes are one class.
+    A chunk with a near and a very far Gaussian could store neither of both finely.
+    """
+    if len(means) == 0:
+        return np.zeros(0, np.int64)
+    distances = np.linalg.norm(means.astype(np.float64), axis=1)
+    relative = distances / max(near_distance(means), MIN_SPAN)
+    classes = np.floor(np.log2(np.maximum(relative, 1)) / LOG2_DISTANCES_PER_CLASS)
+    orders = []
+    for distance_class in np.unique(classes):
+        members = np.flatnonzero(classes == distance_class)
+        orders.append(members[morton_order(means[members])])
+    return np.concatenate(orders)
 
 
 def _encode_tables(columns: GaussianColumns) -> tuple[Floats, NDArray[np.uint32]]:
@@ -130,8 +152,10 @@ def morton_order(means: Floats) -> NDArray[np.int64]:
     """
     if len(means) == 0:
         return np.zeros(0, np.int64)
+    # In an ordinary unit, the logarithms below spread near and far points alike.
+    ordinary_means = means.astype(np.float64) * ordinary_length_factor(means)
     # Logarithms, because a single distant point would otherwise put all near points in one cell.
-    log_positions = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    log_positions = np.sign(ordinary_means) * np.log1p(np.abs(ordinary_means))
     low = log_positions.min(axis=0)  # [3]
     span = np.maximum(log_positions.max(axis=0) - low, MIN_SPAN)
     last_cell = 2**MORTON_BITS - 1

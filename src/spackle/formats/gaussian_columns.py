@@ -134,6 +134,16 @@ class GaussianColumns:
         columns = ([getattr(part, name) for part in parts] for name in names)
         return GaussianColumns(*(np.concatenate(arrays) for arrays in columns))
 
+    def scaled(self, factor: float) -> GaussianColumns:
+        """The scene in another unit of length: centres and scales times a factor."""
+        if factor == 1:
+            return self
+        return dataclasses.replace(
+            self,
+            means=(self.means * np.float64(factor)).astype(np.float32),
+            log_scales=(self.log_scales + np.log(factor)).astype(np.float32),
+        )
+
     def select(self, rows: NDArray[np.int64] | slice) -> GaussianColumns:
         """Return the Gaussians that an index array [M] or a slice selects."""
         names = [field.name for field in dataclasses.fields(self)]

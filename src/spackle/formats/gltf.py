@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.formats.gaussian_columns import GaussianColumns
+from spackle.formats.quantization import ordinary_length_factor
 from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError
 
@@ -31,7 +32,8 @@ GLTF_ARRAY_BUFFER = 34_962
 GLTF_POINTS = 0
 
 IDENTITY_POSE = np.eye(4).ravel().tolist()
-NEAR_PLANE = 0.01  # glTF requires a near plane; viewers may choose their own
+# In metres. glTF requires a near plane; viewers may choose their own.
+NEAR_PLANE_M = 0.01
 
 
 def encode_glb(scene: SceneFile) -> bytes:
@@ -131,7 +133,9 @@ def _describe_scene(
         "buffers": [{"byteLength": sum(array.nbytes for array in attributes.values())}],
     }
     if camera is not None:
-        description["cameras"] = [_describe_lens(camera)]
+        # A scene in a small unit must not vanish before the near plane.
+        near_plane = NEAR_PLANE_M / ordinary_length_factor(attributes["POSITION"])
+        description["cameras"] = [_describe_lens(camera, near_plane)]
     return description
 
 
@@ -185,14 +189,14 @@ def _describe_photo_node(camera: Camera) -> dict[str, Any]:
     return node
 
 
-def _describe_lens(camera: Camera) -> dict[str, Any]:
+def _describe_lens(camera: Camera, near_plane: float) -> dict[str, Any]:
     """Return glTF's perspective camera; `extras` keep the principal point, which glTF lacks."""
     fx, fy = camera.focal
     # The field of view is the vertical one, in radians.
     lens = {
         "yfov": 2 * math.atan2(camera.height, 2 * fy),
         "aspectRatio": camera.width * fy / (camera.height * fx),
-        "znear": NEAR_PLANE,  # glTF requires a number
+        "znear": near_plane,  # glTF requires a number
     }
     extras = {"K": camera.K.tolist(), "width": camera.width, "height": camera.height}
     return {"type": "perspective", "perspective": lens, "extras": extras}

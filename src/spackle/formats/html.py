@@ -30,7 +30,7 @@ from spackle.core.trajectories import (
     disparity_to_offset,
     trajectory_cameras,
 )
-from spackle.formats.quantization import encode_smallest_three
+from spackle.formats.quantization import encode_smallest_three, ordinary_length_factor
 from spackle.runtime.errors import InputError
 
 # The page interpolates linearly between this many positions along a path.
@@ -104,7 +104,14 @@ def page_scene(
         problem = "no Gaussian lies in front of the photo's camera"
         raise InputError(f"{name}: {problem}: nothing can be shown")
 
+    # The page computes in half and single floats, which suit metres: a scene in another unit is
+    # shown in a similar one. Its paths are multiples of its own depths, and so stay the same.
+    length_factor = ordinary_length_factor(base.means.detach().cpu().numpy())
     depths = DepthRange.of(base, is_metric=is_metric)
+    depths = DepthRange(near=depths.near * length_factor, focus=depths.focus * length_factor)
+    if length_factor != 1:
+        base = base.scaled(length_factor)
+        aux = aux.scaled(length_factor)
     limit = _movement_limit(disparity, is_filled=len(aux) > 0)
     # A scene that Spackle completed is shown enlarged a little, as its videos are, which hides
     # most of what was filled in beyond the photo's border.

@@ -19,8 +19,12 @@ from PIL import Image
 
 from spackle.formats.gaussian_columns import Floats, GaussianColumns
 from spackle.formats.quantization import (
+    MAX_DISTANCE_RATIO,
     components_to_fractions,
     encode_smallest_three,
+    near_distance,
+    ordinary_length_factor,
+    shrink_distant,
 )
 from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError
@@ -33,6 +37,7 @@ BIN_COUNT = 1 << 16
 # The part of the codes that is spaced evenly; the others follow the values' density.
 EVEN_CODES_SHARE = 0.25
 
+LENGTH_FACTOR_KEY = "spackleLengthFactor"  # of the number by which all lengths were multiplied
 MAX_POSITION_CODE = 65_535  # a coordinate has 16 bits
 
 # A range of equal values counts as this wide, so that no fraction divides by zero.
@@ -71,12 +76,22 @@ def encode_sog(scene: SceneFile) -> bytes:
         raise InputError(f"{count:,} Gaussians are too many for SOG: use another format")
 
     columns = GaussianColumns.from_gaussians(scene.gaussians)
+    # The logarithmic scale is fine for lengths around 1. A scene that is not in metres is stored in
+    # another unit; other readers pass over the number that says which.
+    length_factor = ordinary_length_factor(columns.means)
+    columns = columns.scaled(length_factor)
+    farthest = MAX_DISTANCE_RATIO * near_distance(columns.means)
+    if np.abs(columns.means).max() > farthest > 0:
+        columns = shrink_distant(columns, farthest)
     positions, low, high = _quantize_positions(columns.means)
     scale_book, scale_codes = codebook(columns.log_scales)
     color_book, color_codes = codebook(columns.harmonics)
+    asset: dict[str, Any] = {"generator": "Spackle"}
+    if length_factor != 1:
+        asset[LENGTH_FACTOR_KEY] = length_factor
     meta = {
         "version": 2,
-        "asset": {"generator": "Spackle"},
+        "asset": asset,
         "count": count,
         "means": {
             "mins": low.tolist(),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from spackle.core.image_files import open_image
 from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
 from spackle.formats.quantization import (
+    check_length_factor,
     codes_to_fractions,
     decode_smallest_three,
     fractions_to_components,
@@ -24,6 +25,7 @@ from spackle.formats.scene_content import DecodedScene, UnsupportedSceneError
 from spackle.formats.sog import (
     CODEBOOK_SIZE,
     FIRST_LARGEST_COMPONENT_CODE,
+    LENGTH_FACTOR_KEY,
     MAX_IMAGE_SIDE_PX,
     MAX_POSITION_CODE,
     META_NAME,
@@ -83,7 +85,7 @@ def read_sog(path: Path) -> DecodedScene:
         srgb=np.clip(harmonics_to_srgb(harmonics), 0, 1),
     )
     return DecodedScene(
-        columns=columns,
+        columns=columns.scaled(1 / _length_factor(meta)),
         format=f"SOG {version}",
         writer=_generator(meta),
         harmonics_degree=_harmonics_degree(meta.get("shN")),
@@ -109,6 +111,19 @@ def _generator(meta: Mapping[str, Any]) -> str | None:
     asset = meta.get("asset")
     generator = asset.get("generator") if isinstance(asset, dict) else None
     return generator if isinstance(generator, str) else None
+
+
+def _length_factor(meta: Mapping[str, Any]) -> float:
+    """Return by what Spackle multiplied all lengths; 1 for scenes in metres and other programs'.
+
+    Raises:
+        ValueError: the number is impossible.
+    """
+    asset = meta.get("asset")
+    stored = asset.get(LENGTH_FACTOR_KEY, 1) if isinstance(asset, dict) else 1
+    factor = float(stored)
+    check_length_factor(factor)
+    return factor
 
 
 def _harmonics_degree(harmonics: Any) -> int:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import bisect
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +14,13 @@ from numpy.typing import NDArray
 from spackle.core.gaussians import Gaussians
 from spackle.formats.gaussian_columns import SH_C0, Floats, GaussianColumns
 from spackle.formats.quantization import (
+    MIN_LENGTH,
     codes_to_fractions,
     decode_smallest_three,
     encode_smallest_three,
+    near_distance,
+    ordinary_length_factor,
+    shrink_distant,
 )
 from spackle.formats.scene_content import DecodedScene, SceneFile, UnsupportedSceneError
 from spackle.formats.spz_container import (
@@ -40,10 +43,6 @@ FRACTION_BITS_OF_EMPTY_SCENE = 12
 
 # The grid has at least this many steps in the distance of the nearest 1 % of the Gaussians.
 MIN_NEAR_STEPS = 2048
-NEAR_QUANTILE = 0.01
-
-# A length of 0 counts as this, so that no ratio divides by zero.
-MIN_LENGTH = 1e-30
 
 # A byte of a colour stands for 0.5 + 0.15 · f_dc, where f_dc is the coefficient of the constant
 # spherical harmonic. This leaves room for colours below 0 and above 1.
@@ -100,6 +99,12 @@ class SpzGrid(NamedTuple):
 
     fraction_bits: int  # the grid's step is 2 to the power of -fraction_bits
     outside_count: int  # how many Gaussians lie beyond the largest coordinate
+    length_factor: float = 1.0  # by which the scene is multiplied before it is rounded
+
+    @property
+    def end(self) -> float:
+        """The largest coordinate of the grid, in the scene's own unit."""
+        return MAX_GRID_COORDINATE / 2.0**self.fraction_bits / self.length_factor
 
 
 def encode_spz(scene: SceneFile) -> bytes:
@@ -120,7 +125,9 @@ def _encode(scene: SceneFile, version: int) -> bytes:
 
     The axes become y up and z backward, as the format requires. Positions are rounded to the
     grid of `spz_grid`. A Gaussian outside of the grid is moved towards the origin and shrunk
-    in proportion, which does not change the view from the origin.
+    in proportion, which does not change the view from the origin. The format has no sizes below
+    0.00005 or above 380: a scene that is not in metres is stored in another unit, and an
+    extension, which other readers skip, says which.
 
     Raises:
         InputError: there are more Gaussians than readers accept.
@@ -132,8 +139,10 @@ def _encode(scene: SceneFile, version: int) -> bytes:
         raise InputError(f"{problem}: use another format")
 
     columns = GaussianColumns.from_gaussians(scene.gaussians).flip_y_and_z()
-    fraction_bits = spz_grid(scene.gaussians).fraction_bits
-    columns = _shrink_into_grid(columns, fraction_bits)
+    grid = spz_grid(scene.gaussians)
+    fraction_bits = grid.fraction_bits
+    columns = columns.scaled(grid.length_factor)
+    columns = shrink_distant(columns, MAX_GRID_COORDINATE / 2.0**fraction_bits)
     header = SpzHeader(
         magic=MAGIC,
         version=version,
@@ -150,7 +159,8 @@ def _encode(scene: SceneFile, version: int) -> bytes:
     max_bytes = max(MAX_BYTES_PER_GAUSSIAN * count, SMALL_FILE_BYTES)
     first_index = _finest_rounding_of_samples(columns, fraction_bits)
     for rounding in ROUNDINGS[first_index:]:
-        data = pack_parts(header, _encode_sections(columns, fraction_bits, rounding))
+        sections = _encode_sections(columns, fraction_bits, rounding)
+        data = pack_parts(header, sections, grid.length_factor)
         if len(data) <= max_bytes:
             break
     return data
@@ -167,42 +177,26 @@ def spz_grid(gaussians: Gaussians) -> SpzGrid:
     means = gaussians.means.detach().to("cpu").double().numpy()  # [N, 3]
     if len(means) == 0:
         return SpzGrid(fraction_bits=FRACTION_BITS_OF_EMPTY_SCENE, outside_count=0)
+    length_factor = ordinary_length_factor(means)
+    means = means * length_factor
     largest_coordinate = np.abs(means).max(axis=1)  # [N]
-    distance = np.sqrt((means * means).sum(axis=1))  # [N]
 
-    # The distance within which the nearest 1 % of the Gaussians lie; the grid must be fine there.
-    near_index = int(NEAR_QUANTILE * len(distance))
-    near_distance = float(np.partition(distance, near_index)[near_index])
+    # The nearest 1 % of the Gaussians begin here; the grid must be fine there.
+    nearest = near_distance(means)
     farthest_coordinate = float(largest_coordinate.max())
     # The most bits with which all coordinates fit: farthest · 2^bits ≤ MAX_GRID_COORDINATE.
     bits_for_all = np.floor(np.log2(MAX_GRID_COORDINATE / max(farthest_coordinate, MIN_LENGTH)))
     # The fewest bits with which the grid is fine enough: near · 2^bits ≥ MIN_NEAR_STEPS.
-    bits_for_near = np.ceil(np.log2(MIN_NEAR_STEPS / max(near_distance, MIN_LENGTH)))
+    bits_for_near = np.ceil(np.log2(MIN_NEAR_STEPS / max(nearest, MIN_LENGTH)))
     fraction_bits = int(
         np.clip(max(bits_for_all, bits_for_near), MIN_FRACTION_BITS, MAX_FRACTION_BITS)
     )
 
     is_outside = largest_coordinate * 2.0**fraction_bits > MAX_GRID_COORDINATE
-    return SpzGrid(fraction_bits=fraction_bits, outside_count=int(is_outside.sum()))
-
-
-def _shrink_into_grid(columns: GaussianColumns, fraction_bits: int) -> GaussianColumns:
-    """Scale each Gaussian outside of the grid, about the origin, until it fits.
-
-    Position and size shrink by the same factor, so the view from the origin stays the same.
-
-    Args:
-        columns: N Gaussians.
-        fraction_bits: how many bits of a coordinate, a fixed-point number of 24 bits, are
-            fractional; the grid ends at the largest such number.
-    """
-    largest_coordinate = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)  # [N]
-    grid_end = MAX_GRID_COORDINATE / 2.0**fraction_bits
-    factor = np.minimum(1, grid_end / np.maximum(largest_coordinate, MIN_LENGTH))[:, None]
-    means = columns.means * factor
-    log_scales = columns.log_scales + np.log(factor)
-    return dataclasses.replace(
-        columns, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32)
+    return SpzGrid(
+        fraction_bits=fraction_bits,
+        outside_count=int(is_outside.sum()),
+        length_factor=length_factor,
     )
 
 
@@ -362,7 +356,7 @@ def decode_spz(data: bytes) -> DecodedScene:
         srgb=np.clip(srgb, 0, 1),
     )
     return DecodedScene(
-        columns=_in_opencv_axes(columns, parts.axes),
+        columns=_in_opencv_axes(columns, parts.axes).scaled(1 / parts.length_factor),
         format=f"SPZ {version}",
         harmonics_degree=parts.header.harmonics_degree,
     )

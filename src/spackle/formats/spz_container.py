@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.formats import zstandard
+from spackle.formats.quantization import check_length_factor
 from spackle.formats.scene_content import UnsupportedSceneError
 
 MAGIC = 0x5053474E  # "NGSP", lowest byte first
@@ -40,6 +41,9 @@ MAX_GAUSSIANS_PER_BYTE = 1024 / 9
 
 HAS_EXTENSIONS = 2  # this bit of the flags says that there are extensions
 COORDINATE_SYSTEM = 0xADBE0003  # kind of the extension that names the axes of the file
+# Kind of the extension in which Spackle states by what all lengths were multiplied: a float64.
+LENGTH_FACTOR = 0x53504B01  # "SPK", and a number of ours
+LENGTH_FACTOR_FORMAT = struct.Struct("<d")
 MAX_EXTENSION_BYTES = 1 << 16  # of all extensions of a file, more than those that are known need
 
 MAX_SKIPPED_BYTES = 1 << 20  # of a block that is inflated and forgotten
@@ -73,26 +77,34 @@ class SpzParts:
     scales: NDArray[np.uint8]  # [N, 3]
     rotations: NDArray[np.uint8]  # [N, 4], in versions 1 and 2 [N, 3]
     axes: int = 0  # the number of the file's axes, if an extension names them; 0 for the usual ones
+    length_factor: float = 1.0  # by which the scene was multiplied, if an extension says it
 
 
-def pack_parts(header: SpzHeader, parts: Sequence[bytes]) -> bytes:
+def pack_parts(header: SpzHeader, parts: Sequence[bytes], length_factor: float = 1.0) -> bytes:
     """Return a whole SPZ file: gzip for the versions up to 3, Zstandard for version 4.
 
     Args:
         header: of the file; its number of frames is filled in here.
         parts: positions, opacities, colours, scales and rotations.
+        length_factor: by which all lengths were multiplied; an extension states it unless it is 1.
     """
+    extensions = b""
+    if length_factor != 1:
+        factor_bytes = LENGTH_FACTOR_FORMAT.pack(length_factor)
+        extensions = EXTENSION_RECORD.pack(LENGTH_FACTOR, len(factor_bytes)) + factor_bytes
+        header = header._replace(flags=header.flags | HAS_EXTENSIONS)
     if header.version < FRAMES_VERSION:
-        return deflate(HEADER.pack(*header) + b"".join(parts))
+        return deflate(HEADER.pack(*header) + b"".join(parts) + extensions)
 
     frames = [zstandard.compress(part) for part in parts]
-    # The table follows the header at once, because there are no extensions.
-    table_start = HEADER.size + HEADER_END.size
+    # The table follows the header and the extensions.
+    table_start = HEADER.size + HEADER_END.size + len(extensions)
     sizes = zip(frames, parts, strict=True)
     return b"".join(
         [
             HEADER.pack(*header._replace(frame_count=len(frames))),
             HEADER_END.pack(table_start),
+            extensions,
             *(TABLE_ROW.pack(len(frame), len(part)) for frame, part in sizes),
             *frames,
         ]
@@ -153,7 +165,7 @@ def _unpack_gzip(data: bytes) -> SpzParts:
         block_bytes = min(MAX_SKIPPED_BYTES, harmonics_bytes - start)
         inflater.decompress(inflater.unconsumed_tail, block_bytes)
     extensions = inflater.decompress(inflater.unconsumed_tail, MAX_EXTENSION_BYTES)
-    return dataclasses.replace(parts, axes=_axes_of_extensions(extensions))
+    return _with_extensions(parts, extensions)
 
 
 def _unpack_frames(data: bytes) -> SpzParts:
@@ -179,26 +191,35 @@ def _unpack_frames(data: bytes) -> SpzParts:
         parts.append(np.frombuffer(part, np.uint8))
         frame_start += frame_bytes
 
-    axes = 0
+    extensions = b""
     if header.flags & HAS_EXTENSIONS:
-        axes = _axes_of_extensions(data[HEADER.size + HEADER_END.size : table_start])
-    return dataclasses.replace(_named_parts(header, parts), axes=axes)
+        extensions = data[HEADER.size + HEADER_END.size : table_start]
+    return _with_extensions(_named_parts(header, parts), extensions)
 
 
-def _axes_of_extensions(records: bytes) -> int:
-    """Return the number of the file's axes that an extension gives; 0 if none does.
+def _with_extensions(parts: SpzParts, records: bytes) -> SpzParts:
+    """Return the content with the axes and the unit that extensions give; others are skipped.
 
     Args:
+        parts: the content, with the usual axes and unit.
         records: the extensions; each begins with its kind and its number of bytes.
+
+    Raises:
+        ValueError: the unit is impossible.
     """
     start = 0
     while start + EXTENSION_RECORD.size <= len(records):
         kind, byte_count = EXTENSION_RECORD.unpack_from(records, start)
         start += EXTENSION_RECORD.size
+        content = records[start : start + byte_count]
         if kind == COORDINATE_SYSTEM:
-            return int.from_bytes(records[start : start + byte_count][:4], "little")
+            parts = dataclasses.replace(parts, axes=int.from_bytes(content[:4], "little"))
+        elif kind == LENGTH_FACTOR:
+            (factor,) = LENGTH_FACTOR_FORMAT.unpack(content)
+            check_length_factor(factor)
+            parts = dataclasses.replace(parts, length_factor=factor)
         start += byte_count
-    return 0
+    return parts
 
 
 def harmonics_count(degree: int) -> int:

@@ -17,7 +17,7 @@ from spackle.formats.compressed_ply import file_order
 from spackle.formats.gaussian_columns import MAX_SCALE, MIN_SCALE
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import load_scene
-from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
+from spackle.formats.spz import spz_grid
 
 # Formats that round positions or sizes; the others keep them as floats.
 ROUNDING_SUFFIXES = (".spz", ".sog", ".compressed.ply")
@@ -54,8 +54,7 @@ def count_coarse(scene: SceneFile, output: Path) -> int:
     distance = (stored.means.double() - original.means.double()).norm(dim=1)
     is_coarse = resized | (distance > MAX_MOVE * sizes[:, 1].exp())
     if output.name.lower().endswith(".spz"):
-        grid_end = MAX_GRID_COORDINATE / 2.0 ** spz_grid(original).fraction_bits
-        is_coarse &= original.means.abs().amax(dim=1) <= grid_end
+        is_coarse &= original.means.abs().amax(dim=1) <= spz_grid(original).end
     return int(is_coarse.sum())
 
 

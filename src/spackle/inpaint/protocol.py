@@ -16,8 +16,9 @@ from spackle.runtime.errors import InputError
 # ProPainter's optical flow works at 1/64 of the input's size, and needs two of these pixels.
 MIN_INPUT_SIDE_PX = 128
 
-# A depth below this, in the scene's unit, is treated as this depth, so that 1 / depth is finite.
-MIN_DEPTH = 1e-6
+# A depth below this is treated as this depth, so that 1 / depth is finite. It is shorter than any
+# depth in a scene of any unit.
+MIN_DEPTH = 1e-30
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

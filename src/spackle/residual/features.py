@@ -24,8 +24,9 @@ MASK_THRESHOLD = 0.95  # τ_α of eq. 4: a pixel with a lower opacity is a hole
 CELL = 2  # pixels along a cell's side
 CELL_PIXELS = CELL * CELL
 RGB_CHANNELS = 3
-# Depths and summed opacities are raised to this before something is divided by them.
+# Ratios and summed opacities are raised to this before something is divided by them.
 MIN_DIVISOR = 1e-6
+TINY = 1e-30  # a length, or an inverse length, that is shorter than any in a scene of any unit
 
 
 def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:
@@ -144,7 +145,7 @@ def _average_cells(
                 if alpha[y, x] < threshold:
                     holes += 1
                 else:
-                    farthest = max(farthest, depth[y, x], np.float32(MIN_DIVISOR))
+                    farthest = max(farthest, depth[y, x], np.float32(TINY))
 
             cell_mask[row, column] = holes > 0
             cell_alpha[row, column] = total_alpha / np.float32(CELL_PIXELS)

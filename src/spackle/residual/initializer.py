@@ -19,7 +19,7 @@ from spackle.core.filters import maximum_filter
 from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.surfels import BEHIND_SURFACE_RATIO, inverse_depth_slope
 from spackle.residual.epipolar import trace_epipolar_lines
-from spackle.residual.features import CELL, MIN_DIVISOR, ViewFeatures, cell_centers
+from spackle.residual.features import CELL, MIN_DIVISOR, TINY, ViewFeatures, cell_centers
 
 # A surface that ends farther inside the photo, as a fraction of the photo's width, is not extended
 # beyond the border.
@@ -347,12 +347,16 @@ def _extend_border_surfaces(
     rim_photo_inverse_depth = at_rim[..., 0]
     rim_ends_inside = at_rim[..., 1] == 0  # `ends_at_border` is false
 
+    # Depths from a millionth of the nearest one to a million times as far, in any unit.
+    nearest = torch.where(known, features.inverse_depth, 0).amax()  # as an inverse depth
+    least_inverse = (MIN_DIVISOR * nearest).clamp_min(TINY)
+    least_length = MIN_DIVISOR / nearest.clamp_min(TINY)
+
     # z_photo = ray_z · z_view + t_z, solved for z_view = (z_photo − t_z) / ray_z.
-    z_minus_t = 1 / rim_photo_inverse_depth.clamp_min(MIN_DIVISOR) - motion[2, 3]  # z_photo − t_z
+    z_minus_t = 1 / rim_photo_inverse_depth.clamp_min(least_inverse) - motion[2, 3]  # z_photo − t_z
     hidden = beyond & (steps > 0) & rim_ends_inside
     extended = beyond & ~hidden & (steps > 0) & (z_minus_t > 0) & (rays[..., 2] > 0)
-    inverse_depth = (rays[..., 2] / z_minus_t.clamp_min(MIN_DIVISOR)).clamp_min(MIN_DIVISOR)
+    inverse_depth = (rays[..., 2] / z_minus_t.clamp_min(least_length)).clamp_min(least_inverse)
 
     # No extended surface comes nearer than the nearest visible one.
-    nearest = torch.where(known, features.inverse_depth, 0).amax()
     return hidden, extended, torch.minimum(inverse_depth, nearest)

@@ -24,7 +24,7 @@ from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.patch_matching import MIN_MEAN_COST, TONE_BLUR_CELLS, Patches
 from spackle.core.patch_search import MIN_VOTE_WEIGHT
 from spackle.inpaint import Inpainter, known_inverse_depth
-from spackle.residual.features import CELL, MIN_DIVISOR, hole_mask
+from spackle.residual.features import CELL, MIN_DIVISOR, TINY, hole_mask
 from spackle.scene_fill.view_completion import SceneViewCompletion
 
 # Standard deviation of the blur that separates structure (low frequencies) from texture.
@@ -37,7 +37,6 @@ BORDER_FADE_DEPTH_RATIO = 0.05
 # Standard deviation of the blur that overlapping Gaussians and votes of patches cause.
 OVERLAP_SIGMA_PX = 0.8
 SHARPENING_STEPS = 2
-MIN_INVERSE_DEPTH = 1e-9  # keeps the logarithm finite
 MIN_COVERAGE = 1e-6  # least weight of the cells that contribute to an interpolated pixel
 
 # Computes the colours of a view's holes. Takes the view, and the smooth colours [h, w, 3] of all
@@ -206,7 +205,7 @@ def continue_border(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     # Row and column of the nearest visible cell; negative if nothing is visible.
     nearest = nearest_known_pixels(view.mask.numpy())  # [2, h, w]
     row, column = torch.from_numpy(nearest).long().clamp_min(0)
-    nearest_inverse_depth = features.inverse_depth[row, column].clamp_min(MIN_INVERSE_DEPTH)
+    nearest_inverse_depth = features.inverse_depth[row, column].clamp_min(TINY)
     log_depth_ratio = (view.initial.inverse_depth / nearest_inverse_depth).log()
 
     # The first cell beyond the border, at the distance 1, has the full colour.
