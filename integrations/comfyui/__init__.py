@@ -115,7 +115,13 @@ class PredictScene:
             given = relative_depth(stored, depth_kind, near, far, eighth)
             base = open_base(BaseSettings(depth=given))
         prediction, _ = base.predict(photo)
-        return (Scene(prediction.gaussians, Gaussians.empty(), prediction.camera),)
+        scene = Scene(
+            prediction.gaussians,
+            Gaussians.empty(),
+            prediction.camera,
+            is_metric=prediction.is_metric,
+        )
+        return (scene,)
 
 
 class CompleteScene:
@@ -135,7 +141,8 @@ class CompleteScene:
     ) -> tuple[Scene]:
         """Add Gaussians in the holes; base Gaussians do not change."""
         cameras = scene.path(trajectory, disparity)
-        made = complete_scene(BasePrediction(scene.base, scene.camera, {}), cameras, fill=fill)
+        prediction = BasePrediction(scene.base, scene.camera, {}, is_metric=scene.is_metric)
+        made = complete_scene(prediction, cameras, fill=fill)
         return (dataclasses.replace(made, disparity=disparity),)
 
 

@@ -86,7 +86,7 @@ def _with_depth(case: Case) -> Case:
 
 def _read_depth(path: Path, K: Tensor) -> DepthMap:
     """Read a depth map, with the intrinsics [3, 3] of its frame's camera."""
-    return dataclasses.replace(load_depth(path), K=K)
+    return dataclasses.replace(load_depth(path, kind="metric"), K=K)
 
 
 def _frames_of_scene(name: str, folder: Path) -> list[PosedPhoto]:
