@@ -87,12 +87,12 @@ def file_order(scene: SceneFile) -> NDArray[np.int64]:
     means = scene.gaussians.means.detach().to("cpu", torch.float32).numpy()
     # If it is not known which Gaussians fill holes, all are sorted together.
     base_count = 0 if scene.base_count is None else scene.base_count
-    base_order = _spatial_order(means[:base_count])
-    fill_order = base_count + _spatial_order(means[base_count:])
+    base_order = spatial_order(means[:base_count])
+    fill_order = base_count + spatial_order(means[base_count:])
     return np.concatenate([base_order, fill_order])
 
 
-def _spatial_order(means: Floats) -> NDArray[np.int64]:
+def spatial_order(means: Floats) -> NDArray[np.int64]:
     """Return the indices [N] that sort points [N, 3] by distance classes, then by Morton's curve.
 
     A class reaches from one distance to a thousand times as far, so that most scenes are one class.
