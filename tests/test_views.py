@@ -12,7 +12,7 @@ from helpers.scenes import box_before_wall
 
 from spackle.core.camera import Camera
 from spackle.core.keyframes import Keyframe, KeyframePath
-from spackle.core.trajectories import DEFAULT_OVERSCAN, TRAJECTORIES, TrajectoryKind
+from spackle.core.trajectories import DEFAULT_OVERSCAN, TRAJECTORIES, DepthRange, TrajectoryKind
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio
 from spackle.scene import Scene
@@ -70,12 +70,13 @@ def test_every_trajectory_is_filled_where_it_is_reported_and_shown(
 
     # Other viewers show the path through the photo's own lens.
     scene = filled.scene
+    depth_range = DepthRange.of(scene.base)
     own_lens = dataclasses.replace(path, overscan=0.0)
-    wide = own_lens.video_cameras(scene.base, scene.camera, None, DISPARITY)
+    wide = own_lens.video_cameras(depth_range, scene.camera, None, DISPARITY)
     assert filled.largest_hole_ratio(wide) <= MAX_HOLE_RATIO
 
     # The video of the saved scene, drawn anew, consists of the planned frames.
-    drawn = path.video_cameras(scene.base, scene.camera, None, DISPARITY)
+    drawn = path.video_cameras(depth_range, scene.camera, None, DISPARITY)
     for (index,), view in zip(views.frames, drawn, strict=True):
         assert torch.equal(views.cameras[index].world_to_camera, view.world_to_camera)
         assert torch.equal(views.cameras[index].K, view.K)

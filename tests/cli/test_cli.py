@@ -189,11 +189,11 @@ def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path,
         pair[1]: (
             "depth map",
             "64×48",
-            "2 m near, 6 m median, 6 m far",
+            "near 2 m, median 6 m, far 6 m",
             "0.0%",
             f"--depth {pair[1]}",
         ),
-        depth: ("depth map", "2 m near"),
+        depth: ("depth map", "near 2 m"),
         clip: ("clip", "24×16", "3, 10 a second", "none", "spackle predict"),
     }
     for path, parts in expected.items():

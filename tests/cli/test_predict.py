@@ -387,7 +387,7 @@ def test_a_frame_is_cut_off_unless_geometry_is_given(tmp_path: Path) -> None:
     assert report_of(out / "a")["photo"] == {**inner, "frame_cut_off": cut_off}
     assert "is cut off" not in run(*lite, "--keep-frame").err
     assert report_of(out / "a")["photo"] == whole
-    depth = write_depth(tmp_path / "a.npy", np.pad(metres(), ((6, 7), (3, 4)), constant_values=1))
+    depth = write_depth(tmp_path / "a.npy", np.pad(metres(), ((6, 7), (3, 4)), mode="edge"))
     predicted(photo, depth, out, "--no-render")
     assert report_of(out / "a")["photo"] == whole
 
