@@ -137,11 +137,23 @@ class World:
 
     def albedo(self, hits: Hits, footprint_m: Floats) -> Floats:
         """[N, 3] linear colours of the surfaces at hits, filtered over `footprint_m` [N] metres."""
-        colors = np.zeros((len(hits.triangle), 4), np.float32)
+        return self._texels(hits.triangle, hits.u, hits.v, footprint_m)[:, :3]
+
+    def _coverage(self, triangle: Ints, u: Floats, v: Floats) -> Floats:
+        """[N] coverage of the material at points of triangles; 1 without a texture."""
+        footprint_m = np.zeros(len(triangle), np.float32)
+        return self._texels(triangle, u, v, footprint_m)[:, 3]
+
+    def _texels(self, triangle: Ints, u: Floats, v: Floats, footprint_m: Floats) -> Floats:
+        """[N, 4] linear colour and coverage of the material at points of triangles.
+
+        `footprint_m` [N] is how wide an area each colour is the mean of, in metres.
+        """
+        texels = np.zeros((len(triangle), 4), np.float32)
         _albedo(
-            hits.triangle,
-            hits.u,
-            hits.v,
+            triangle,
+            u,
+            v,
             footprint_m,
             self.mesh.uv,
             self.mesh.material,
@@ -153,31 +165,9 @@ class World:
             self.pyramids.sizes,
             self.pyramids.levels,
             BYTE_TO_LINEAR,
-            colors,
+            texels,
         )
-        return colors[:, :3]
-
-    def _coverage(self, triangle: Ints, u: Floats, v: Floats) -> Floats:
-        """[N] coverage of the material at points of triangles; 1 without a texture."""
-        colors = np.zeros((len(triangle), 4), np.float32)
-        _albedo(
-            triangle,
-            u,
-            v,
-            np.zeros(len(triangle), np.float32),
-            self.mesh.uv,
-            self.mesh.material,
-            self.texture,
-            self.color,
-            self.texel_density,
-            self.pyramids.texels,
-            self.pyramids.offsets,
-            self.pyramids.sizes,
-            self.pyramids.levels,
-            BYTE_TO_LINEAR,
-            colors,
-        )
-        return colors[:, 3]
+        return texels
 
 
 def _paint(material: Material) -> tuple[float, float, float]:

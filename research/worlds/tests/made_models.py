@@ -1,4 +1,4 @@
-"""A catalogue of boxes, as a file like those of Sweet Home 3D."""
+"""A catalogue of boxes, as a file like those of Sweet Home 3D, and lights."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import io
 import zipfile
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
+from worlds.lights import Lights
 
 BOX = """mtllib box.mtl
 v -1 0 -1
@@ -80,3 +82,18 @@ def write_catalogue(path: Path) -> None:
             archive.writestr(f"boxes/{name}/box.mtl", MTL)
             archive.writestr(f"boxes/{name}/picture.png", picture.getvalue())
         archive.writestr("PluginFurnitureCatalog.properties", "\n".join(lines))
+
+
+def lights(**changes: object) -> Lights:
+    """A white sky and nothing else, but for the changes."""
+    facts: dict[str, object] = {
+        "sky": np.ones((8, 16, 3), np.float32),
+        "sun_direction": np.array([0, 0, 1], np.float32),
+        "sun_color": np.zeros(3, np.float32),
+        "sun_spread": 0.0,
+        "portals": np.zeros((0, 3, 3), np.float32),
+        "lamp_positions": np.zeros((0, 3), np.float32),
+        "lamp_radii": np.zeros(0, np.float32),
+        "lamp_colors": np.zeros((0, 3), np.float32),
+    }
+    return Lights(**(facts | changes))  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from made_models import lights
 
 pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 
@@ -18,21 +19,6 @@ from worlds.pictures import linear_to_srgb, pyramids, srgb_to_linear
 pytestmark = pytest.mark.slow
 UP = np.array([[0.0, 0.0, 1.0]], np.float32)
 FLOOR = quad((-5, -5, 0), (10, 0, 0), (0, 10, 0), Material((0.5, 0.5, 0.5)))
-
-
-def lights(**changes: object) -> Lights:
-    """A white sky and nothing else, but for the changes."""
-    facts: dict[str, object] = {
-        "sky": np.ones((8, 16, 3), np.float32),
-        "sun_direction": np.array([0, 0, 1], np.float32),
-        "sun_color": np.zeros(3, np.float32),
-        "sun_spread": 0.0,
-        "portals": np.zeros((0, 3, 3), np.float32),
-        "lamp_positions": np.zeros((0, 3), np.float32),
-        "lamp_radii": np.zeros(0, np.float32),
-        "lamp_colors": np.zeros((0, 3), np.float32),
-    }
-    return Lights(**(facts | changes))  # type: ignore[arg-type]
 
 
 def light_on_floor(world: World, light: Lights, x: float = 0.0) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_models import write_catalogue
+from made_models import lights, write_catalogue
 
 pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 
@@ -177,18 +177,8 @@ def test_outlines_are_mixed_and_depth_is_not(furniture: Furniture, cache: Path) 
     world = World(joined([black, bright]), {})
     axes = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
     viewpoint = Viewpoint(np.zeros(3, np.float32), axes, Camera.from_focal(20.0, 16, 8))
-    dark = {
-        "sky": np.zeros((4, 8, 3), np.float32),
-        "sun_direction": np.array([0, 0, 1], np.float32),
-        "sun_color": np.zeros(3, np.float32),
-        "sun_spread": 0.0,
-        "portals": np.zeros((0, 3, 3), np.float32),
-        "lamp_positions": np.zeros((0, 3), np.float32),
-        "lamp_radii": np.zeros(0, np.float32),
-        "lamp_colors": np.zeros((0, 3), np.float32),
-    }
-    lights = views.Lights(**dark)  # type: ignore[arg-type]
-    (view,) = views.render(np.random.default_rng(0), world, lights, viewpoint, [viewpoint.camera])
+    dark = lights(sky=np.zeros((4, 8, 3), np.float32))
+    (view,) = views.render(np.random.default_rng(0), world, dark, viewpoint, [viewpoint.camera])
     # The outline is at 0.3 pixels right of the middle.
     row = view.radiance[4, :, 0]
     assert row[7] < 0.1
