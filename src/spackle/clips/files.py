@@ -20,7 +20,7 @@ from torch import Tensor
 
 from spackle.core.color_spaces import REFERENCE_WHITE_NITS, color_space_of_cicp, to_srgb
 from spackle.core.image_files import check_pixel_count
-from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.errors import InputError, as_input_error, with_detached_errors
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Progress
 from spackle.video.encoding import BT709
@@ -112,17 +112,7 @@ def read_clip(
             codec.
     """
     check_file(path, "clip")
-    try:
-        return _read_clip(path, max_frames, progress)
-    except InputError as error:
-        message = str(error)
-        cause = error.__cause__
-
-    # A new error, because the traceback of the first one refers to the decoder, whose threads would
-    # live as long as the error.
-    if cause is not None:
-        cause = cause.with_traceback(None)
-    raise InputError(message) from cause
+    return with_detached_errors(lambda: _read_clip(path, max_frames, progress))
 
 
 def _read_clip(

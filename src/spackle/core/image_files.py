@@ -40,7 +40,7 @@ from spackle.core.tiff_directories import (
     read_directories,
     tiff_from_directory,
 )
-from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.errors import InputError, as_input_error, with_detached_errors
 from spackle.runtime.files import check_file
 
 T = TypeVar("T")
@@ -119,17 +119,7 @@ def read_picture(path: str | os.PathLike[str], read: Callable[[OpenPicture], T])
             is a raw file without a large preview.
     """
     check_file(path, "photo")
-    try:
-        return _read_picture(path, read)
-    except InputError as error:
-        message = str(error)
-        cause = error.__cause__
-
-    # A new error, because the traceback of the first one refers to the decoder, whose threads and
-    # memory would live as long as the error.
-    if cause is not None:
-        cause = cause.with_traceback(None)
-    raise InputError(message) from cause
+    return with_detached_errors(lambda: _read_picture(path, read))
 
 
 def _read_picture(path: str | os.PathLike[str], read: Callable[[OpenPicture], T]) -> T:

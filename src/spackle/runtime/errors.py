@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import re
 import reprlib
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
 
 from spackle.runtime.suggestions import closest_name
+
+Result = TypeVar("Result")
 
 MAX_MESSAGE_LENGTH = 300  # characters of a message that may quote a program's values
 MAX_REASON_LENGTH = 200  # characters of a library's message that ours quotes
@@ -91,6 +93,23 @@ def as_input_error(what: object, problem: str, *errors: type[Exception]) -> Iter
     except bad_input as error:
         explained = problem.replace("{reason}", reason_in_a_line(error))
         raise InputError(f"{what}: {explained}") from error
+
+
+def with_detached_errors(read: Callable[[], Result]) -> Result:
+    """`read()`; an InputError that it raises is raised anew, without its traceback.
+
+    The traceback refers to the decoder that found the problem. The decoder's threads and memory
+    would live as long as the error, which a server may keep.
+    """
+    try:
+        return read()
+    except InputError as error:
+        message = str(error)
+        cause = error.__cause__
+
+    if cause is not None:
+        cause = cause.with_traceback(None)
+    raise InputError(message) from cause
 
 
 @contextlib.contextmanager
