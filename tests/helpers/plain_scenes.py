@@ -49,19 +49,25 @@ def with_largest(parts: np.ndarray, places: np.ndarray) -> np.ndarray:
     return np.array([np.insert(*numbers) for numbers in zip(parts, places, largest, strict=True)])
 
 
+# By the flags of an SPZ file: without extensions, and with the one that states the unit: a
+# kind, a length and a float64.
+EXTENSION_BYTES = {0: 0, 2: 16}
+
+
 def spz_columns(data: bytes) -> Columns:
     raw = gzip.decompress(data)
     magic, version, count, degree, bits, flags, reserved = struct.unpack("<4sIIBBBB", raw[:16])
-    assert (magic, version, degree, flags, reserved) == (b"NGSP", 3, 0, 0, 0)
-    assert len(raw) == 16 + 20 * count
-    return spz_body_columns(np.frombuffer(raw, np.uint8, offset=16), count, bits)
+    assert (magic, version, degree, reserved) == (b"NGSP", 3, 0, 0)
+    assert len(raw) == 16 + 20 * count + EXTENSION_BYTES[flags]
+    return spz_body_columns(np.frombuffer(raw, np.uint8, 20 * count, offset=16), count, bits)
 
 
 def spz_4_columns(data: bytes) -> Columns:
     magic, version, count, degree, bits, flags, frames, start = struct.unpack(
         "<4sIIBBBBI12x", data[:32]
     )
-    assert (magic, version, degree, flags, frames, start) == (b"NGSP", 4, 0, 0, 5, 32)
+    assert (magic, version, degree, frames) == (b"NGSP", 4, 0, 5)
+    assert start == 32 + EXTENSION_BYTES[flags]
     sizes = np.frombuffer(data, "<u8", 2 * frames, offset=start).reshape(frames, 2)
     ends = start + 16 * frames + np.cumsum(sizes[:, 0])
     assert ends[-1] == len(data)
