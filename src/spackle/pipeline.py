@@ -378,18 +378,12 @@ class Pipeline:
         """
         # The fill gets only some of the planned views, and names each by its position among them.
         cameras = [views.cameras[index] for index in views.views_to_fill]
-        always_filled_positions = [
-            position
-            for position, index in enumerate(views.views_to_fill)
-            if index in views.always_filled
-        ]
         filled = fill_scene(
             context,
             cameras,
             # Between given views nothing will be rendered.
             exact=self.given_path.cameras is not None,
             progress=progress,
-            always_filled=always_filled_positions,
         )
 
         # Some views the fill has rendered after the last Gaussians that they needed. If a frame of

@@ -376,7 +376,6 @@ class PlannedViews:
     reported_views: dict[str, int]
     # Not every frame of a long video, because neighbours in a path show the same holes.
     views_to_fill: list[int]
-    always_filled: frozenset[int]  # those that are filled even if views near them are filled
     # Views that are filled instead of frames, which they show with a margin; and their frames.
     frame_within: dict[int, int]
     # The first views of `cameras` are this number of views that are shown in the video, reported or
@@ -451,15 +450,12 @@ def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathVie
 
     ValueError if the scene allows no such path.
     """
+    depth_range = prediction.depth_range
     frame_cameras = path.video_cameras(
-        prediction.depth_range,
-        prediction.camera,
-        keyframes=None,
-        disparity=prediction.max_disparity,
+        depth_range, prediction.camera, keyframes=None, disparity=prediction.max_disparity
     )
     camera = prediction.camera.even()
     disparity = path.disparity_or(prediction.max_disparity)
-    depth_range = prediction.depth_range
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
     # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other
@@ -537,7 +533,6 @@ def _index_views(
     }
     cameras.extend(path_views.reported_cameras.values())
     shown_view_count = len(cameras)
-    always_filled = frozenset(range(frame_view_end, shown_view_count))
     # Given views bring no cameras just for the report, because it measures all of them. They are
     # the first views of the list.
     if not reported_views:
@@ -554,16 +549,13 @@ def _index_views(
                 views_to_fill.append(len(cameras))
                 frame_within[len(cameras)] = index
                 cameras.append(_with_margin(cameras[index], path_views.filled_margin_px))
-    views_to_fill.extend(sorted(always_filled))
+    views_to_fill.extend(range(frame_view_end, shown_view_count))  # what the report measures
 
     return PlannedViews(
         cameras=cameras,
         frames=frames,
         reported_views=reported_views,
         views_to_fill=views_to_fill,
-        # The fill leaves out views near those that it has filled. What the report measures is
-        # filled in any case.
-        always_filled=always_filled,
         frame_within=frame_within,
         shown_view_count=shown_view_count,
         given_view_count=len(given_views),

@@ -36,7 +36,7 @@ from spackle.render.protocol import Rendering
 from spackle.residual import ViewFeatures, completion, hole_area_ratio, hole_mask, initialize
 from spackle.residual.initializer import inside_photo
 from spackle.scene_fill import FillContext, fill, fill_scene, fill_view
-from spackle.scene_fill.fill import GUARDED_VIEWS, farthest_first
+from spackle.scene_fill.fill import GUARDED_VIEWS, farthest_first, view_differences
 from spackle.scene_fill.texture import group_by_cell
 from spackle.scene_fill.underlay import UNDERLAY_REACH_CELLS, UNDERLAY_STRIDE, rim_underlay
 from spackle.scene_fill.unet import UNet
@@ -57,6 +57,11 @@ def path_of(
     return trajectory_cameras(
         kind, context.photo_camera, disparity, DepthRange.of(context.base, is_metric=True), frames
     )
+
+
+def order_of(cameras: list[Camera], photo_camera: Camera, near_depth: float) -> list[int]:
+    """The views' indices in the order in which a fill visits them."""
+    return farthest_first(view_differences([*cameras, photo_camera], photo_camera, near_depth))
 
 
 def turned_right(camera: Camera, degrees: float, right: float = 0.0) -> Camera:
@@ -96,17 +101,17 @@ def test_an_empty_view_is_filled_with_a_wall(
 def test_the_order_of_views() -> None:
     camera = Camera.from_focal(50, 40, 30)
     views = [shifted(camera, x) for x in (-1.0, -0.2, 0.0, 0.6, 1.1)]
-    assert farthest_first(views, camera, 1.0) == [4, 0, 3, 1, 2]  # the photo's camera counts
-    assert sorted(farthest_first([camera] * 3, camera, 1.0)) == [0, 1, 2]
+    assert order_of(views, camera, 1.0) == [4, 0, 3, 1, 2]  # the photo's camera counts
+    assert sorted(order_of([camera] * 3, camera, 1.0)) == [0, 1, 2]
 
 
 def test_views_from_one_eye_are_ordered_by_what_they_show() -> None:
     camera = Camera.from_focal(50, 40, 30)
     turned = [turned_right(camera, degrees) for degrees in (1.0, 2.0, 30.0, 29.0, 0.0)]
-    assert farthest_first(turned, camera, 1.0) == [2, 1, 3, 0, 4]
+    assert order_of(turned, camera, 1.0) == [2, 1, 3, 0, 4]
     # A wider view shows more than one that is zoomed; the photo's own zoom comes last.
     zoomed = [camera, camera.zoomed(1.1), camera.zoomed(0.7)]
-    assert farthest_first(zoomed, camera, 1.0)[0] == 2
+    assert order_of(zoomed, camera, 1.0)[0] == 2
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])
@@ -114,7 +119,7 @@ def test_the_order_of_views_does_not_depend_on_the_scenes_unit(scale: float) -> 
     camera = Camera.from_focal(50, 40, 30)
     offsets = [(-1.0, 0.0), (0.2, 20.0), (0.0, -30.0), (0.4, 0.0)]
     orders = [
-        farthest_first(
+        order_of(
             [turned_right(camera, degrees, right=unit * x) for x, degrees in offsets],
             camera,
             unit,
@@ -141,7 +146,7 @@ def test_no_aux_gaussian_of_a_scene_hides_the_photo() -> None:
 def test_an_underlay_is_hidden_and_closes_holes_of_neighbours() -> None:
     context, _ = box_view(width=160, height=120)
     path = path_of(context)
-    index = farthest_first(path, context.photo_camera, context.near_depth)[0]
+    index = order_of(path, context.photo_camera, context.near_depth)[0]
     camera, before = path[index], CPU.render(context.base, path[index])
     features = ViewFeatures.of(before)
     mask, seen = features.mask, ~hole_mask(before.alpha)
@@ -234,7 +239,7 @@ def test_all_frames_are_filled_and_a_view_that_shows_the_same_is_not_rendered_ag
     for index, picture in filled.pictures.items():  # equal to the final scene, bit for bit
         assert torch.equal(picture, to_uint8(after[index].rgb))
     assert max(hole_area_ratio(view.alpha) for view in after) <= 1e-3
-    for index in farthest_first(path, context.photo_camera, context.near_depth)[:GUARDED_VIEWS]:
+    for index in order_of(path, context.photo_camera, context.near_depth)[:GUARDED_VIEWS]:
         before = CPU.render(context.base, path[index])
         seen = ~hole_mask(before.alpha)
         assert psnr(after[index].rgb[seen], before.rgb[seen]) >= 45

@@ -41,15 +41,14 @@ class BasePrediction:
     max_disparity: float = DEFAULT_MAX_DISPARITY  # largest camera move with correct geometry
     max_hole_ratio: float = DEFAULT_MAX_HOLE_RATIO  # share of the widest views that may be holes
     is_metric: bool = True  # whether the unit of length is known to be the metre
+    # [H, W, 3] sRGB: the photo at the camera's size, which residual networks see (I in eq. 5).
+    # None: unknown, as for Gaussians of another tool; a rendering of the Gaussians then stands in.
+    photo: Tensor | None = dataclasses.field(default=None, repr=False, compare=False)
 
     @property
     def depth_range(self) -> DepthRange:
         """The depths on which a camera path depends; ValueError if nothing is before the camera."""
         return DepthRange.of(self.gaussians, is_metric=self.is_metric)
-
-    # [H, W, 3] sRGB: the photo at the camera's size, which residual networks see (I in eq. 5).
-    # None: unknown, as for Gaussians of another tool; a rendering of the Gaussians then stands in.
-    photo: Tensor | None = dataclasses.field(default=None, repr=False, compare=False)
 
 
 class Base(Protocol):

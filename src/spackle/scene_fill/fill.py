@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -95,31 +95,27 @@ def fill_scene(
     cameras: Sequence[Camera],
     exact: bool = False,
     progress: Progress | None = None,
-    *,
-    always_filled: Collection[int] = (),
 ) -> FilledScene:
     """Complete all views of a path with one set of Gaussians.
 
     The widest views come first, then always the view that differs most from all earlier ones. Each
-    view is
-    rendered with the base (the Gaussians predicted from the photo) and all Gaussians added before,
-    and then gets new Gaussians in its holes and beneath the rims of its holes. New Gaussians lie
-    behind all surfaces that the photo, the widest views and earlier views show.
+    view is rendered with the base (the Gaussians predicted from the photo) and all Gaussians added
+    before, and then gets new Gaussians in its holes and beneath the rims of its holes. New
+    Gaussians lie behind all surfaces that the photo, the widest views and earlier views show.
 
     Args:
         context: the photo's base and the settings of the fill.
         cameras: the frames of a path in order; with `exact`, any views.
         exact: check every view, and complete every view that has a hole. Otherwise invisibly small
-            holes may remain, and views that show nearly the same as a checked view are not checked.
+            holes may remain, and a view that shows the same as a checked one is not checked.
         progress: called with (number of views that are done, number of views).
-        always_filled: indices of cameras that are checked in any case.
     """
     device = context.base.means.device
     if not cameras:
         return FilledScene(Gaussians.empty(device), {})
 
     # Everything is done on the renderer's device; the result returns to the base's device.
-    filling = _SceneFilling(context.on_renderer_device, cameras, exact, always_filled)
+    filling = _SceneFilling(context.on_renderer_device, cameras, exact)
     for count, index in enumerate(filling.order, start=1):
         if filling.needs_visit(index):
             filling.visit(index)
@@ -132,31 +128,25 @@ def fill_scene(
 class _SceneFilling:
     """The state of `fill_scene` between two views: what was added, which surfaces are guarded."""
 
-    def __init__(
-        self,
-        context: FillContext,
-        cameras: Sequence[Camera],
-        exact: bool,
-        always_filled: Collection[int],
-    ) -> None:
+    def __init__(self, context: FillContext, cameras: Sequence[Camera], exact: bool) -> None:
         """Put the views in order, render the widest ones, and guard the surfaces they show.
 
         Args:
             context: the photo's base and the settings of the fill, on the renderer's device.
             cameras: the views.
-            exact: visit every view, and leave no hole. Otherwise views that show nearly the same
-                as a visited one are left out, and invisibly small holes stay open.
-            always_filled: indices of views that are visited in any case.
+            exact: visit every view, and leave no hole. Otherwise a view that shows the same as a
+                visited one is left out, and invisibly small holes stay open.
         """
         self.context = context
         self.cameras = cameras
         self.exact = exact
-        self.always_filled = set(always_filled)
         self.max_hole_ratio = 0.0 if exact else INVISIBLE_HOLE_RATIO
-        near_depth = context.near_depth
-        self.order = farthest_first(cameras, context.photo_camera, near_depth)
-        self.differences = view_differences(cameras, context.photo_camera, near_depth)  # [V, V]
-        # [V] whether a visited view shows nearly the same.
+
+        photo_camera = context.photo_camera
+        differences = view_differences([*cameras, photo_camera], photo_camera, context.near_depth)
+        self.order = farthest_first(differences)
+        self.differences = differences[:-1, :-1]  # [V, V], between the views alone
+        # [V] whether a visited view shows the same.
         self.is_settled = torch.zeros(len(cameras), dtype=torch.bool)
 
         # No new Gaussian may hide what the photo or one of the widest views shows.
@@ -182,8 +172,8 @@ class _SceneFilling:
         self.pictures: dict[int, Tensor] = {}
 
     def needs_visit(self, index: int) -> bool:
-        """Whether a view may still have visible holes: no visited view shows nearly the same."""
-        return self.exact or index in self.always_filled or not self.is_settled[index]
+        """Whether a view may still have visible holes: no visited view shows the same."""
+        return self.exact or not self.is_settled[index]
 
     def visit(self, index: int) -> None:
         """Render a view with everything added so far, and fill its holes if they are visible."""
@@ -313,21 +303,18 @@ def _fill_in_passes(
     return _FilledHoles(aux, underlays, rendering)
 
 
-def farthest_first(cameras: Sequence[Camera], photo_camera: Camera, near_depth: float) -> list[int]:
-    """Indices of views: first the view that differs most from the photo's, then always the view
+def farthest_first(differences: Tensor) -> list[int]:
+    """Indices of V views: first the view that differs most from the photo's, then always the view
     that differs most from all earlier ones.
 
     The first n views are thus spread evenly over what all views show, for any n.
 
     Args:
-        cameras: the views.
-        photo_camera: the camera of the photo.
-        near_depth: depth of the nearest surfaces, in the scene's unit.
+        differences: [V + 1, V + 1] from `view_differences`, of the views and, last, the photo's.
     """
-    differences = view_differences([*cameras, photo_camera], photo_camera, near_depth)
     nearest = differences[-1, :-1].clone()  # of each view, from the photo's or an earlier view
     order: list[int] = []
-    for _ in cameras:
+    for _ in range(len(nearest)):
         farthest = int(nearest.argmax())
         order.append(farthest)
         nearest = torch.minimum(nearest, differences[farthest, :-1])

@@ -30,7 +30,7 @@ from spackle.inpaint import INPAINTERS, Inpainter, known_inverse_depth
 from spackle.pipeline import complete
 from spackle.render import Renderer
 from spackle.residual import hole_mask
-from spackle.scene_fill.fill import farthest_first
+from spackle.scene_fill.fill import farthest_first, view_differences
 
 # Two views are the same if their cameras are closer than this times the path's greatest offset.
 SAME_VIEW_DISTANCE = 1e-3
@@ -228,8 +228,10 @@ def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Rendere
     _, inverse_depths = render_completed(views, renderer)
     targets = views.rgb.clone()
     painted: list[int] = []  # views whose holes are filled
+    photo_camera = views.prediction.camera
     near_depth = DepthRange.of(views.prediction.gaussians).near
-    for index in farthest_first(views.cameras, views.prediction.camera, near_depth):
+    differences = view_differences([*views.cameras, photo_camera], photo_camera, near_depth)
+    for index in farthest_first(differences):
         camera = views.cameras[index]
         target = targets[index]
         hole = views.mask[index].clone()
