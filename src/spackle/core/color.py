@@ -85,10 +85,10 @@ class DepthColorScale:
             depth: [H, W] in the unit of the scale.
             known: [H, W] bool.
         """
-        # 0 at the far end of the scale, 1 at its near end.
-        span = max(
-            1 / self.near - 1 / self.far, 1e-12 / self.near
-        )  # positive even for one single depth
+        # 0 at the far end of the scale, 1 at its near end. A scale of one single depth has no span,
+        # and gets a tiny one, so that nothing is divided by zero.
+        span = 1 / self.near - 1 / self.far
+        span = max(span, 1e-12 / self.near)
         # What is nearer than the scale begins is as bright as its beginning. The clamp also avoids
         # a division by zero where the depth is unknown.
         brightness = ((1 / depth.clamp_min(self.near) - 1 / self.far) / span).clamp(0, 1)
