@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,9 @@ from helpers.command import names_in, refuses, run
 from helpers.evaluation_data import write_boxes
 from helpers.sharp_weights import MICRO_SIZE, write_tiny
 from PIL import Image
+
+from spackle.paper.evaluation import figures
+from spackle.paper.evaluation.pictures import GridRow, draw_grid
 
 
 def check_latex(*files: Path) -> None:
@@ -33,6 +37,43 @@ def check_latex(*files: Path) -> None:
             if line.endswith(r"\\") and "multicolumn" not in line
         ]
         assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {len(rows[0]) - 1}
+
+
+def test_each_row_of_a_figure_names_scene_base_and_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_boxes(tmp_path / "data" / "Ball_1", 0)
+    words = ("evaluate", tmp_path / "data", "--dataset", "middlebury", "--metrics", "none")
+    choices = ("--disparity", "0.6", "--methods", "base,paper", "-o", tmp_path / "out")
+    tiny = write_tiny(tmp_path / "sharp.safetensors", MICRO_SIZE)
+    assert run(*words, *choices, "--base", "sharp", "-c", tiny, "--precision", "fp32").code == 0
+    drawn: list[tuple[Sequence[str], Sequence[GridRow]]] = []
+
+    def draw(titles: Sequence[str], rows: Sequence[GridRow], **sizes: int) -> Image.Image:
+        drawn.append((titles, rows))
+        return draw_grid(titles, rows, **sizes)
+
+    monkeypatch.setattr(figures, "draw_grid", draw)
+    assert run("figures", tmp_path / "out", "-o", tmp_path / "figures").code == 0
+    ((titles, (row,)),) = drawn
+    assert titles == ["Input", "Base alone", "Eqs. 2 to 9"]
+    assert re.fullmatch(
+        r"Middlebury, Ball_1\. Base: SHARP stand-in\. Disparity 0\.6, (left|right)\. "
+        r"Residual: Spackle's own weights\.",
+        row.caption,
+    )
+    # The label is in the figure's own pixels.
+    with Image.open(tmp_path / "figures" / "comparison.png") as picture:
+        unlabelled = draw_grid(titles, [row._replace(caption="")], 100, 39)
+        labelled = draw_grid(titles, [row], 100, 39)
+        assert labelled.height > unlabelled.height
+        assert picture.height > labelled.height
+
+
+def test_rows_are_shared_among_evaluations() -> None:
+    assert figures._share_rows([1, 4, 1], 6) == [1, 4, 1]
+    assert figures._share_rows([5, 5, 0], 4) == [2, 2, 0]
+    assert figures._share_rows([1, 1, 1], 2) == [1, 1, 1]
 
 
 def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:

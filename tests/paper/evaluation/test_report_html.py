@@ -92,8 +92,11 @@ def test_a_page_is_well_formed_and_contains_everything(tmp_path: Path) -> None:
     plots = (str(image["src"]) for image in page.named("img") if image.get("class") == "plot")
     drawings = [ElementTree.fromstring(base64.b64decode(plot.partition(",")[2])) for plot in plots]
     assert len(drawings) == 3  # near views: PSNR, distance; large views: holes
+    # A plot that is copied from the page says what it shows.
+    for drawing in drawings:
+        assert "base rgbd" in "".join(drawing.itertext())
     sections = [part["id"] for part in page.named("section")]
-    assert sections == ["summary", "plots", "pictures", "tables", "setup"]
+    assert sections == ["summary", "pictures", "plots", "tables", "setup"]
     assert not re.search(r"://|@import|url\(|\*\*", text)
     assert text.count("<script") == 1
     assert "<b>damaged" not in text

@@ -53,13 +53,15 @@ class PaperFigure:
     # Names of pictures: "input", "hole" or a method; methods that no run has are left out.
     columns: tuple[str, ...]
     needed_method: str  # the figure shows evaluations with this method
+    preferred_method: str = ""  # if some of them have this method, only they are shown
     caption: str  # with {views}, {bases}, {methods} and {weights} to be filled in
 
 
 COMPARISON = PaperFigure(
     name="comparison",
-    columns=("input", "base", "paper", "spackle"),
+    columns=("input", "base", "paper-initial", "paper", "spackle"),
     needed_method="base",
+    preferred_method="spackle",
     caption=(
         "Qualitative comparison under large viewpoint changes ({views}). From left to right: the "
         "input image, the view rendered from {bases} with holes in red boxes, and the view by "
@@ -69,7 +71,7 @@ COMPARISON = PaperFigure(
 
 DIRECT_FINE_TUNING = PaperFigure(
     name="direct_ft",
-    columns=("input", "base", "paper", "spackle", "direct-ft", "hole"),
+    columns=("input", "base", "paper", "direct-ft", "hole"),
     needed_method="direct-ft",
     caption=(
         "Generated supervision applied directly to the base ({views}). From left to right: the "
@@ -79,8 +81,23 @@ DIRECT_FINE_TUNING = PaperFigure(
 )
 
 FIGURES = (COMPARISON, DIRECT_FINE_TUNING)
-COLUMN_TITLES = {"input": "Input", "hole": "Occluded regions", "direct-ft": "Direct FT"}
+# Titles of columns where they differ from the method's: short, because columns are narrow.
+COLUMN_TITLES = {
+    "input": "Input",
+    "base": "Base alone",
+    "paper-initial": "Initial Gaussians",
+    "paper": "Eqs. 2 to 9",
+    "spackle": "Spackle",
+    "direct-ft": "Direct FT",
+    "hole": "Occluded regions",
+}
 
+# Where the residual network's weights came from, in the words of a row's label.
+WEIGHTS_WORDS = {
+    "shipped": "Spackle's own weights",
+    "given": "given weights ({digest})",
+    "initial": "no weights",
+}
 # Sentences of a caption about the residual network's weights, by where they came from.
 WEIGHTS_SENTENCES = {
     "shipped": (
@@ -129,7 +146,7 @@ def make_figures(folders: Sequence[Path], max_rows: int, output: Path, reporter:
     # A figure that needs a method which no evaluation has is left out.
     drawn_figures = {}
     for figure in FIGURES:
-        shown_runs = [source for source in large_runs if figure.needed_method in source.run.methods]
+        shown_runs = _runs_of_figure(figure, large_runs)
         drawn = _draw_figure(figure, shown_runs, max_rows)
         if drawn is not None:
             drawn_figures[figure.name] = drawn
@@ -150,6 +167,13 @@ def make_figures(folders: Sequence[Path], max_rows: int, output: Path, reporter:
     with results_folder(output, files, locked=True):
         _write_figures(drawn_figures, output)
     reporter.log(f"{', '.join(files)} -> {output}")
+
+
+def _runs_of_figure(figure: PaperFigure, runs: Sequence[RunWithFolder]) -> list[RunWithFolder]:
+    """The evaluations that a figure shows: those with the methods that it needs or prefers."""
+    possible = [source for source in runs if figure.needed_method in source.run.methods]
+    preferred = [source for source in possible if figure.preferred_method in source.run.methods]
+    return preferred or possible
 
 
 def _write_figures(drawn_figures: Mapping[str, DrawnFigure], output: Path) -> None:
@@ -177,26 +201,27 @@ def _draw_figure(
 
     # Boxes are drawn around holes, so the picture of the hole is needed even if it is not shown.
     needed_pictures = [*columns, HOLE_PICTURE]
-    rows = []
+    images_of_runs = []
     for run, folder in runs:
         complete_images = []
         for image in run.measured_images:
             files = stored_pictures(run, folder, image)
             if all(name in files for name in needed_pictures):
                 complete_images.append(image)
+        images_of_runs.append(complete_images)
 
-        rows_of_run = max(1, max_rows // len(runs))
-        for index in evenly_spaced_indices(len(complete_images), rows_of_run):
-            row = _figure_row(figure, columns, run, folder, complete_images[index])
-            rows.append(row)
+    rows = []
+    row_counts = _share_rows([len(images) for images in images_of_runs], max_rows)
+    for (run, folder), images, count in zip(runs, images_of_runs, row_counts, strict=True):
+        for index in evenly_spaced_indices(len(images), count):
+            rows.append(_figure_row(figure, columns, run, folder, images[index]))
     if not rows:
         return None
 
     # Each base is named once, because evaluations usually have the same.
     bases = ", ".join(dict.fromkeys(run.base_title for run, _ in runs))
-    titles = [_column_title(column, bases) for column in columns]
     picture = draw_grid(
-        titles,
+        [COLUMN_TITLES.get(column) or METHODS[column].title for column in columns],
         rows,
         picture_width=round(TEXT_WIDTH_INCHES * DOTS_PER_INCH / len(columns)),
         font_size=round(FONT_POINTS / POINTS_PER_INCH * DOTS_PER_INCH),
@@ -208,6 +233,23 @@ def _draw_figure(
     return DrawnFigure(picture, latex)
 
 
+def _share_rows(image_counts: Sequence[int], max_rows: int) -> list[int]:
+    """The number of rows of each evaluation, which has so many images: at least one, if it can.
+
+    Evaluations take turns to get one row more, until there are `max_rows` or no more images.
+    """
+    row_counts = [min(1, count) for count in image_counts]
+    while sum(row_counts) < max_rows:
+        open_indices = [
+            index for index, count in enumerate(image_counts) if row_counts[index] < count
+        ]
+        if not open_indices:
+            break
+        # Those with the fewest rows come first.
+        row_counts[min(open_indices, key=lambda index: row_counts[index])] += 1
+    return row_counts
+
+
 def _drawn_columns(figure: PaperFigure, runs: Sequence[RunWithFolder]) -> list[str]:
     """The columns of a figure for which any of these evaluations has pictures."""
     methods = {method for run, _ in runs for method in run.methods}
@@ -216,13 +258,6 @@ def _drawn_columns(figure: PaperFigure, runs: Sequence[RunWithFolder]) -> list[s
         for column in figure.columns
         if column in (INPUT_PICTURE, HOLE_PICTURE) or column in methods
     ]
-
-
-def _column_title(column: str, bases: str) -> str:
-    """The title above a figure's column; "base" has the names of the bases, `bases`."""
-    if column == "base":
-        return bases
-    return COLUMN_TITLES.get(column) or METHODS[column].title
 
 
 def _figure_row(
@@ -257,7 +292,21 @@ def _figure_row(
             else:
                 tag = _added_share_tag(run, image, name)
         row.append(GridPicture(picture, tag, boxes))
-    return GridRow(caption="", pictures=row)
+    return GridRow(_row_label(run, image), row)
+
+
+def _row_label(run: Run, image: str) -> str:
+    """The line above an image's pictures: scene, base, view and the residual network's weights.
+
+    It is drawn into the figure, which may be copied without its caption.
+    """
+    setting, view = run.view_with_largest_hole(image)
+    residual = run.config["residual"]
+    weights = WEIGHTS_WORDS[str(residual["weights"])].format(digest=str(residual["sha256"])[:8])
+    return (
+        f"{run.title}, {image}. Base: {run.base_title}. Disparity {setting}, {view}. "
+        f"Residual: {weights}."
+    )
 
 
 def _draw_frame(picture: Image.Image) -> None:

@@ -310,7 +310,9 @@ def write_contact_sheets(run: Run, folder: Path) -> None:
     # Large camera moves have no true picture.
     names = [*run.methods, TRUE_PICTURE] if run.compares_with_photos else run.methods
     titles = [picture_title(run, name) for name in names]
-    heading = f"{run.title}, {run.config['protocol']}, by {ranking.criterion}"
+    heading = (
+        f"{run.title}, base {run.base_title}, {run.config['protocol']}, by {ranking.criterion}"
+    )
     # The font has no arrows.
     heading = heading.replace("↑", "(higher is better)").replace("↓", "(lower is better)")
 

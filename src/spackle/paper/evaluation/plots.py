@@ -96,6 +96,7 @@ def plots_of_run(run: Run) -> list[Plot]:
 
 def _draw_plot(
     title: str,
+    run: Run,
     series: Sequence[Series],
     x_title: str,
     y_title: str,
@@ -106,7 +107,8 @@ def _draw_plot(
     """Draw series of points as an SVG image; the same series give the same bytes.
 
     Args:
-        title: the plot's title, which stands outside of the image.
+        title: the plot's title.
+        run: the evaluation; the plot says which scenes and which base it shows.
         series: the points of each method.
         x_title: the title of the x axis.
         y_title: the title of the y axis.
@@ -137,6 +139,8 @@ def _draw_plot(
                 label=method_series.title,
             )
         axes.set(xlabel=x_title, ylabel=y_title)
+        # Inside of the image, which may be copied from the page.
+        figure.suptitle(f"{title}\n{run.title}, base {run.base_title}", fontsize="medium")
         finish_axes(axes)
         figure.legend(loc="outside lower left", frameon=False, ncols=1)
 
@@ -174,6 +178,7 @@ def hole_area_plot(run: Run) -> Plot | None:
 
     return _draw_plot(
         "Hole Area Ratio against disparity",
+        run,
         series,
         x_title="disparity of the view",
         y_title="HAR, share of the pixels",
@@ -294,6 +299,7 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
     height_inches = PLOT_HEIGHT_INCHES / 2 + SCENE_HEIGHT_INCHES * len(scenes)
     return _draw_plot(
         title,
+        run,
         series,
         x_title=x_title,
         y_title="",  # the rows' names say what they are

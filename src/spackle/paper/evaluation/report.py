@@ -15,6 +15,7 @@ from markupsafe import Markup, escape
 
 from spackle.core.image_files import open_image
 from spackle.paper.evaluation.measurements import (
+    NEAR_SETTING,
     REMARK_METRIC,
     Measurement,
     Run,
@@ -43,7 +44,8 @@ from spackle.paper.evaluation.table import (
     Table,
     group_widths,
 )
-from spackle.paper.evaluation.table_texts import method_row_name
+from spackle.paper.evaluation.table_numbers import Column, texts_of_methods
+from spackle.paper.evaluation.table_texts import overview_notes
 from spackle.paper.evaluation.tables import make_tables, prepend_group_name
 
 REPORT_FILE = "report.html"  # the page, and in this package its template
@@ -74,12 +76,14 @@ class MeansColumn(NamedTuple):
 
 # By metric, in the order of the columns; a column without numbers is left out.
 MEANS_COLUMNS = {
+    "distance": MeansColumn(METRICS["distance"].title, METRICS["distance"].format),
+    "psnr": MeansColumn(METRICS["psnr"].title, METRICS["psnr"].format),
     "psnr_hole": MeansColumn("PSNR in the hole ↑", "{:.2f}".format),
     "ssim_hole": MeansColumn("SSIM in the hole ↑", "{:.4f}".format),
     **{
         name: MeansColumn(metric.title, metric.format)
         for name, metric in METRICS.items()
-        if name != "ssim"
+        if name not in ("distance", "psnr", "ssim")
     },
     "har": MeansColumn("HAR ↓", NUMBER_FORMATS["ratio"]),
     "aux": MeansColumn("added GS", NUMBER_FORMATS["count"]),
@@ -110,8 +114,6 @@ class ReportPart:
 
     run: Run
     paper_images: int | None  # the number of the dataset's images in the paper
-    methods: Sequence[str]  # names of the methods' rows
-    summary: Table
     plots: Sequence[Plot]
     ranking: Ranking | None
     images: Sequence[ReportImage]
@@ -143,6 +145,7 @@ def make_report(sources: Sequence[tuple[Run, Path]], *, with_unmeasured: bool = 
 
     page = template.render(
         title=f"Spackle: evaluation on {datasets}",
+        overview=overview_table([run for run, _ in evaluations]),
         parts=[_part_of_run(run, folder, images_each) for run, folder in evaluations],
         tables=make_tables(runs, with_unmeasured=with_unmeasured),
         runs=runs,
@@ -191,8 +194,6 @@ def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
     return ReportPart(
         run=run,
         paper_images=PAPER_IMAGE_COUNTS.get(run.title),
-        methods=[method_row_name(run, method) for method in run.methods],
-        summary=means_table(run, run.measurements),
         plots=plots_of_run(run),
         ranking=ranking,
         images=images,
@@ -212,6 +213,74 @@ def _position_text(index: int, count: int) -> str:
     if index == count - 1:
         return "best"
     return f"{index + 1} of {count}"
+
+
+def overview_table(runs: Sequence[Run]) -> Table:
+    """What all evaluations measured, in a row for each method, grouped by scenes and base.
+
+    Columns are the holes that remain at each size of the camera move, and the metrics against true
+    second photos; columns without numbers are left out.
+    """
+    settings = dict.fromkeys(
+        setting for run in runs if not run.compares_with_photos for setting in run.settings
+    )
+    columns = [
+        Column(
+            group="Hole area ratio ↓",
+            title=setting_title(setting),
+            setting=setting,
+            metric="har",
+            format=NUMBER_FORMATS["ratio"],
+        )
+        for setting in settings
+    ]
+    columns += [
+        Column(
+            group="Against true second photos",
+            title=column.title,
+            setting=NEAR_SETTING,
+            metric=metric,
+            format=column.format,
+            lower_is_better=not column.title.endswith("↑"),
+        )
+        for metric, column in MEANS_COLUMNS.items()
+        if metric not in ("har", "aux")
+    ]
+
+    # Evaluations of large views and of near views with one base share their rows.
+    runs_by_group: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        runs_by_group.setdefault((run.title, run.base_title), []).append(run)
+
+    groups = []
+    for (title, base), group_runs in runs_by_group.items():
+        methods = list(dict.fromkeys(method for run in group_runs for method in run.methods))
+        measurements = [measurement for run in group_runs for measurement in run.measurements]
+        rows = texts_of_methods(measurements, columns, methods)
+        names = [picture_title(group_runs[0], method) for method in methods]
+        groups.append((f"{title}, base {base}", names, rows))
+
+    shown = [
+        index
+        for index in range(len(columns))
+        if any(texts[index] for _, _, rows in groups for texts in rows)
+    ]
+    bodies = []
+    for group_title, names, rows in groups:
+        row_texts = [
+            (name, *(texts[index] for index in shown))
+            for name, texts in zip(names, rows, strict=True)
+        ]
+        bodies.append(prepend_group_name(group_title, row_texts))
+    return Table(
+        label="",
+        title="",
+        caption="",
+        heads=[("", ""), ("", ""), *((columns[i].group, columns[i].title) for i in shown)],
+        bodies=bodies,
+        word_columns=2,
+        notes=overview_notes(runs),
+    )
 
 
 def means_table(run: Run, measurements: Iterable[Measurement]) -> Table:

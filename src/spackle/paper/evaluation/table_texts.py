@@ -154,6 +154,16 @@ def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
     return [*dict.fromkeys(notes), *layout.notes]
 
 
+def overview_notes(runs: Sequence[Run]) -> list[str]:
+    """Notes below an overview of evaluations: scenes, bases, methods and weights."""
+    notes = [f"{run.title}: {run.about_scenes}." for run in runs if run.about_scenes]
+    notes += [f"Base {run.base_title}: {run.base_description}." for run in runs]
+    descriptions = [describe_method(method) for run in runs for method in run.methods]
+    notes += [f"{description.title}: {description.summary}." for description in descriptions]
+    notes += [_residual_note(run) for run in runs]
+    return list(dict.fromkeys(notes))
+
+
 def _views_note(run: Run) -> str:
     """The note that says which views of each image were rendered."""
     if not run.compares_with_photos:
