@@ -24,7 +24,7 @@ demo: $(VENV)/.demo
 	$(BIN)/spackle demo --output demo-output
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # What a minute can tell: all tests of values, kernels and files, without commands, browsers and training.
 test-fast: $(VENV)/.installed

@@ -14,41 +14,52 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # Tests must not use downloaded weights.
 os.environ["SPACKLE_WEIGHTS"] = str(Path(__file__).with_name("no weights"))
 
-# Files whose tests walk commands, processes, a browser or a training, or compute for many seconds:
-# `make test-fast` leaves them out.
+# Files and folders whose tests walk commands, processes, a browser or a training, or compute for
+# many seconds: `make test-fast` leaves them out. Those that take longest come first, here and in a
+# run, so that no process is left alone with a long one at the end.
 JOURNEYS = (
-    "bases/test_lite.py",
-    "bases/test_moge.py",
-    "bases/test_sharp.py",
+    "test_quick_start.py",
+    "web",
     "cli",
-    "formats/test_export.py",
     "fuzz",
     "paper/dataset/test_dataset_build.py",
+    "paper/training/test_whole_views.py",
+    "paper/training/test_training.py",
+    "test_extensions.py",
     "paper/evaluation/test_bench.py",
+    "test_examples.py",
+    "scene_fill/test_fill_scene.py",
+    "paper/evaluation/test_mode_paper.py",
     "paper/evaluation/test_evaluate.py",
+    "paper/training/test_direct_ft.py",
+    "test_api.py",
+    "bases/test_sharp.py",
+    "bases/test_moge.py",
+    "bases/test_lite.py",
+    "render/test_kernels.py",
     "paper/evaluation/test_figures.py",
     "paper/evaluation/test_pairs.py",
     "paper/evaluation/test_report_html.py",
-    "paper/training/test_direct_ft.py",
-    "paper/training/test_training.py",
-    "paper/training/test_whole_views.py",
-    "render/test_kernels.py",
     "runtime/test_workers.py",
-    "scene_fill/test_fill_scene.py",
-    "test_api.py",
-    "test_examples.py",
-    "test_extensions.py",
-    "test_quick_start.py",
-    "web",
+    "formats/test_export.py",
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of `JOURNEYS`."""
+    """Mark the tests of `JOURNEYS`, and run them first, in their order."""
     journeys = [Path(__file__).parent / name for name in JOURNEYS]
+
+    def place(item: pytest.Item) -> int:
+        """The place of a test's file in `JOURNEYS`; their number, if it is in none."""
+        for index, journey in enumerate(journeys):
+            if item.path == journey or journey in item.path.parents:
+                return index
+        return len(journeys)
+
     for item in items:
-        if any(item.path == journey or journey in item.path.parents for journey in journeys):
+        if place(item) < len(journeys):
             item.add_marker("journey")
+    items.sort(key=place)
 
 
 settings.register_profile("repeat", derandomize=True, deadline=None)

@@ -34,7 +34,7 @@ def test_damaged_files_leave_no_thread_no_file_and_no_memory_behind(count: int) 
 
 
 def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
-    assert run("-n", 120) == ""
+    assert run("-n", 60) == ""
 
 
 def test_small_files_with_a_large_announced_size_stay_below_the_bound(tmp_path: Path) -> None:

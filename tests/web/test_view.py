@@ -231,7 +231,7 @@ def test_a_service_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:
             server, _ = served_at(lines[1][lines[1].index("http:") :].split()[0])
             assert server.root == f"/{token}"
             id = server.send(photo.read_bytes()).json["id"]
-            eventually(lambda: server.ask(f"{SCENES}/{id}").json["stage"] == "base")
+            eventually(lambda: server.ask(f"{SCENES}/{id}").json["state"] == "running")
             os.killpg(process.pid, signal.SIGTERM)  # as a service manager ends it
             assert process.wait(PATIENCE_S) == 130
             assert process.stderr.read().splitlines()[-1] == "interrupted"

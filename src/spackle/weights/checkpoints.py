@@ -90,7 +90,9 @@ def load_strict(
 
 
 def to_channels_last(network: nn.Module) -> None:
-    """Convert a network's kernels to the memory format channels-last, which is faster on a CPU."""
+    """Convert a network's kernels to the memory format channels-last, which is faster on a CPU: the
+    channels of a pixel are neighbours.
+    """
     # The stubs of torch lack this overload.
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
