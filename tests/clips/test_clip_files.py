@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -182,3 +183,36 @@ def test_hdr_becomes_srgb_in_all_frames_alike(
     assert abs(found[:4] - colors[:4]).max() < 3
     # White makes room for brighter light that another frame may have.
     assert 200 < found[4].min() <= found[4].max() < 222
+
+
+def test_a_clip_is_told_by_its_content_too(tmp_path: Path) -> None:
+    for name in ("five.mp4", "five.mkv", "five.webm"):
+        shutil.copy(CLIPS / name, tmp_path / "clip.insv")
+        assert is_clip(tmp_path / "clip.insv")
+    Image.fromarray(picture()).save(tmp_path / "photo", "AVIF")
+    assert not is_clip(tmp_path / "photo")
+    assert not is_clip(tmp_path / "nowhere")
+
+
+def test_a_360_clip_is_refused(tmp_path: Path) -> None:
+    description = (
+        b'<?xml version="1.0"?><rdf:SphericalVideo xmlns:rdf="http://www.w3.org/1999/02/22-rdf-'
+        b'syntax-ns#" xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">'
+        b"<GSpherical:StitchingSoftware>a camera</GSpherical:StitchingSoftware>"
+        b"<GSpherical:Spherical>true</GSpherical:Spherical><GSpherical:Stitched>true"
+        b"</GSpherical:Stitched><GSpherical:ProjectionType>equirectangular"
+        b"</GSpherical:ProjectionType></rdf:SphericalVideo>"
+    )
+    box = bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + description
+    box = struct.pack(">I", len(box) + 8) + b"uuid" + box
+    # The box belongs at the end of the track, whose size and that of its parent grow.
+    content = bytearray((CLIPS / "five.mp4").read_bytes())
+    for kind in (b"moov", b"trak"):
+        place = content.index(kind) - 4
+        (size,) = struct.unpack_from(">I", content, place)
+        struct.pack_into(">I", content, place, size + len(box))
+        end = place + size
+    assert content.index(b"mdat") < content.index(b"moov")  # places of frames stay
+    (tmp_path / "a.mp4").write_bytes(content[:end] + box + content[end:])
+    with pytest.raises(InputError, match="a 360° panorama: cut a flat view out of it"):
+        read_clip(tmp_path / "a.mp4")

@@ -28,6 +28,7 @@ from helpers.photo_files import (
     colors_of,
     deep_tiff,
     exif,
+    full_box,
     gpano,
     heic,
     icc_profile,
@@ -200,6 +201,10 @@ HDR = {
     "AVIF, ICC with the numbers of PQ": lambda: avif(
         as_pq(CODES), box(b"colr", b"prof", icc_profile("2020", 2.2, cicp=bytes([9, 16, 0, 1])))
     ),
+    "AVIF, ICC named PQ": lambda: avif(
+        as_pq(CODES),
+        box(b"colr", b"prof", icc_profile("2020", 2.2).replace(b"made by hand", b"Rec. 2100 PQ")),
+    ),
     "PNG of 8 bits, PQ": lambda: png(
         (as_pq(CODES) * 255).round().astype(np.uint8), (b"cICP", bytes([9, 16, 0, 1]))
     ),
@@ -343,6 +348,18 @@ def test_a_turned_avif_with_ten_bits_is_upright(tmp_path: Path) -> None:
     assert abs(colors_of(np.rot90(rgb, -1)) * 255 - PATCHES).max() < 3
 
 
+def test_an_avif_with_ten_bits_keeps_its_opacity(tmp_path: Path) -> None:
+    colors, properties = av1_item(as_pq(CODES))
+    half, own = av1_item(np.full((*CODES.shape[:2], 3), 0.5))
+    kind = b"urn:mpeg:mpegB:cicp:systems:auxiliary:alpha\0"
+    items = [
+        (b"av01", colors, [*properties, nclx(9, 16, 9)]),
+        (b"av01", half, [*own, full_box(b"auxC", kind)]),
+    ]
+    rgb = read(tmp_path, item_file(items, references=[(b"auxl", 2, [1])]))
+    assert abs(rgb * 255 - (PATCHES + 255) / 2).max() < 3
+
+
 def test_transparency_lies_over_white_in_any_space(tmp_path: Path) -> None:
     alpha = np.full((*CODES.shape[:2], 1), 128, np.uint8)
     rgb = read(tmp_path, png(np.concatenate([CODES, alpha], axis=-1), CICP_P3))
@@ -370,9 +387,20 @@ def test_pictures_in_memory_keep_what_pillow_knows_of_their_colours(tmp_path: Pa
         ("p3", None): jpeg(CODES, icc_profile=icc_profile("p3", None)),
         ("adobe", ADOBE_GAMMA): jpeg(CODES, exif=ADOBE_EXIF),
         ("2020", 1.8): png(CODES, (b"cHRM", chrm("2020")), GAMMA_18),
+        ("p3", 1.0): png(CODES, (b"cICP", bytes([12, 8, 0, 1]))),
+        ("2020", None): avif(CODES / 255, nclx(9, 13, 9)),
     }
     for (primaries, gamma), content in files.items():
-        photo = photo_from_picture(Image.open(io.BytesIO(content)))
+        image = Image.open(io.BytesIO(content))
+        photo = photo_from_picture(image)
+        assert np.asarray(image.convert("RGB")).shape == CODES.shape  # it can still be used
+        ours = colors_of(photo.rgb.numpy())
+        assert abs(ours - meaning(primaries, gamma)).max() * 255 < 4, primaries
+        # A picture that is loaded already knows the name of its file.
+        (tmp_path / "a").write_bytes(content)
+        with Image.open(tmp_path / "a") as image:
+            image.load()
+            photo = photo_from_picture(image)
         ours = colors_of(photo.rgb.numpy())
         assert abs(ours - meaning(primaries, gamma)).max() * 255 < 4, primaries
 

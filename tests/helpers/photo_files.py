@@ -536,7 +536,7 @@ CODES_OF_KINDS = {
     "SVG": b'<svg xmlns="http://www.w3.org/2000/svg">',
     "HTML": b"\n<!DOCTYPE html><html>",
     "video": b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom",
-    "video or sound": b"RIFF\0\0\0\0AVI LIST",
+    "RIFF": b"RIFF\0\0\0\0WAVEfmt ",
     "ZIP": b"PK\x03\x04",
     "pointer of Git LFS": b"version https://git-lfs.github.com/spec/v1\n",
     "AppleDouble": b"\0\5\x16\7",

@@ -20,6 +20,17 @@ import numpy as np
 import pillow_heif
 import pytest
 from helpers import ROOT
+from helpers.photo_files import (
+    ADOBE_RGB_BY_EXIF,
+    PATCHES,
+    as_pq,
+    avif,
+    colors_of,
+    exif,
+    jpeg,
+    nclx,
+    squares,
+)
 from helpers.photos import metres
 from helpers.systems import needs_proc
 from helpers.web_client import (
@@ -37,10 +48,12 @@ from helpers.web_client import (
 )
 from PIL import Image
 
+from spackle.core.photo import load_photo
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import WORKER_DIED
 from spackle.web.jobs import RetentionLimits
 from spackle.web.uploads import safe_display_name
+from spackle.web.work import check_photo
 
 
 @pytest.fixture(scope="module")
@@ -430,3 +443,16 @@ def test_the_example_mounts_the_app(tmp_path: Path) -> None:
             assert mine.ask(f"{SCENES}/{sent['id']}/files/scene.spz").body[:2] == b"\x1f\x8b"
         finally:
             service.terminate()
+
+
+def test_the_preview_of_a_photo_has_its_colours(tmp_path: Path) -> None:
+    files = {
+        "hdr": avif(as_pq(squares(PATCHES)), nclx(9, 16, 9)),
+        "adobe": jpeg(squares(PATCHES).astype(np.uint8), exif=exif({0x0112: 3}, ADOBE_RGB_BY_EXIF)),
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        check_photo(tmp_path / name, name, tmp_path / "preview.jpg")
+        expected = load_photo(tmp_path / name).rgb.numpy() * 255
+        with Image.open(tmp_path / "preview.jpg") as preview:
+            assert abs(colors_of(np.asarray(preview).astype(float) - expected)).max() < 8, name

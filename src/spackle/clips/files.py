@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import torch
 from av.container import InputContainer
+from av.sidedata.sidedata import Type as SideData
 from av.stream import Disposition
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
@@ -20,6 +22,7 @@ from torch import Tensor
 
 from spackle.core.color_spaces import REFERENCE_WHITE_NITS, color_space_of_cicp, to_srgb
 from spackle.core.image_files import check_pixel_count
+from spackle.core.image_formats import kind_of_file
 from spackle.runtime.errors import InputError, as_input_error, with_detached_errors
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Progress
@@ -71,15 +74,15 @@ class Clip:
 
 
 def is_clip(path: Path) -> bool:
-    """Whether a file is a video, judged by the suffix; a GIF with a single frame is a photo.
+    """Whether a file is a video, by its suffix or its first bytes.
 
-    A file that cannot be read as a GIF is no clip.
+    A GIF with a single frame is a photo, and so is a file that cannot be read as a GIF.
     """
     suffix = path.suffix.lower()
-    if suffix not in CLIP_SUFFIXES or os.path.isdir(path):
+    if os.path.isdir(path):
         return False
     if suffix != ".gif":
-        return True
+        return suffix in CLIP_SUFFIXES or _begins_as_video(path)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             # Two pictures make a clip. The packets hold one picture each; an empty packet marks the
@@ -93,6 +96,14 @@ def is_clip(path: Path) -> bool:
     except (av.FFmpegError, ValueError, IndexError):
         return False
     return False
+
+
+def _begins_as_video(path: Path) -> bool:
+    """Whether a file begins as an MP4, a QuickTime, a Matroska or an AVI does."""
+    try:
+        return kind_of_file(path).is_video
+    except InputError:
+        return False  # its reader says what is wrong
 
 
 def read_clip(
@@ -144,6 +155,13 @@ def _read_clip(
                 progress(frames_read, max(frames_read, max_frames or stream.frames))
     if frame is None:
         raise InputError(f"{path}: has no frames: give another clip")
+    # mypy takes the elements for keys, because the container is a Mapping.
+    side_data: Iterable[Any] = frame.side_data
+    if any(data.type is SideData.SPHERICAL for data in side_data):
+        raise InputError(
+            f"{path}: a 360° panorama: cut a flat view out of it first, at most 100° wide "
+            "(docs/inputs.md has a command)"
+        )
 
     # All frames have the size and the rotation of the last one.
     width, height = _square_pixel_size(frame, pixel_aspect)

@@ -113,9 +113,9 @@ def _to_16_bits(codes: NDArray[Any], bits: int) -> Codes:
 
 
 def _decode_avif(file: BinaryIO, max_pixels: int) -> Codes | None:
-    """The primary picture of an AVIF; None if it has 8 bits, or transparency.
+    """The primary picture of an AVIF; None if it has 8 bits, or is a grid with transparency.
 
-    A picture is one item, or a grid of items.
+    A picture is one item, or a grid of items; another item may hold its opacity.
     """
     file.seek(0)
     items = HeifItems.of(file.read())
@@ -126,11 +126,17 @@ def _decode_avif(file: BinaryIO, max_pixels: int) -> Codes | None:
     settings = items.property(tiles[0], b"av1C") if tiles else None
     # The third byte of the settings begins with profile flags; this bit says "more than 8 bits".
     is_deep = settings is not None and len(settings) > 2 and settings[2] & 0x40
-    has_alpha = any(kind == b"auxl" and primary in to for kind, _, to in items.references)
-    if not is_deep or has_alpha:
+    alpha_item = items.alpha_of(primary)
+    if not is_deep:
         return None
     if items.types.get(primary) != GRID:
-        return _rgb_of_frame(_decode_item(items, primary, max_pixels), items, primary)
+        colors = _rgb_of_frame(_decode_item(items, primary, max_pixels), items, primary)
+        if alpha_item is None:
+            return colors
+        opacity = _opacity_of_frame(_decode_item(items, alpha_item, max_pixels))
+        return np.concatenate([colors, opacity[..., None]], axis=-1)
+    if alpha_item is not None:
+        return None
 
     # The item of a grid says how many tiles there are, and how much of them is shown.
     grid = items.content(primary)
@@ -204,6 +210,14 @@ def _rgb_of_frame(frame: av.VideoFrame, items: HeifItems, item: int) -> Codes:
     bits = frame.format.components[0].bits
     planes = [_plane(frame, index) for index in range(len(frame.planes))]
     return ycbcr_to_rgb(planes, bits, matrix, is_full_range=is_full_range)
+
+
+def _opacity_of_frame(frame: av.VideoFrame) -> Codes:
+    """[H, W] in 0..65535 of a frame whose luminance is an opacity; ValueError for 8 bits."""
+    bits = frame.format.components[0].bits
+    if bits <= 8:
+        raise ValueError("an opacity of 8 bits")
+    return ycbcr_to_rgb([_plane(frame, 0)], bits, UNSPECIFIED, is_full_range=True)[..., 0]
 
 
 def _plane(frame: av.VideoFrame, index: int) -> NDArray[np.uint16]:

@@ -23,6 +23,11 @@ _DEPTH_ITEM_TYPES = {
     b"urn:mpeg:avc:2015:auxid:2",
     b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth",
 }
+_ALPHA_ITEM_TYPES = {
+    b"urn:mpeg:hevc:2015:auxid:1",
+    b"urn:mpeg:avc:2015:auxid:1",
+    b"urn:mpeg:mpegB:cicp:systems:auxiliary:alpha",
+}
 # Items that are pictures; others hold EXIF or XMP.
 _PICTURE_TYPES = {b"hvc1", b"av01", b"avc1", b"jpeg", b"grid", b"iden", b"iovl", b"unci", b"vvc1"}
 GRID = b"grid"  # the type of an item that is composed of tiles
@@ -103,6 +108,14 @@ class HeifItems:
         """Whether the item's rotation swaps its width and height."""
         steps = _orientation_steps(self.properties.get(item, [])) or ""
         return steps.count("t") % 2 == 1
+
+    def alpha_of(self, item: int) -> int | None:
+        """The item that holds the opacity of a picture; None without."""
+        for kind, source, targets in self.references:
+            types = _item_types(self.properties.get(source, []))
+            if kind == b"auxl" and item in targets and types & _ALPHA_ITEM_TYPES:
+                return source
+        return None
 
     def shown_pictures(self) -> list[int]:
         """The items that are pictures of their own: no tile, thumbnail, mask or gain map."""

@@ -7,12 +7,20 @@ LittleCMS, as Pillow offers it, reads all profiles, but only pictures of 8 bits.
 from __future__ import annotations
 
 import io
+import re
 import struct
 
 import numpy as np
 from PIL import Image, ImageCms
 
-from spackle.core.color_spaces import D50_XYZ, SRGB, ColorSpace, Floats, Transfer
+from spackle.core.color_spaces import (
+    D50_XYZ,
+    SRGB,
+    ColorSpace,
+    Floats,
+    Transfer,
+    color_space_of_cicp,
+)
 
 MAX_TAGS = 100  # a profile has a dozen
 SAME_LIGHT = 0.005  # curves that differ by less are rounded differently
@@ -61,6 +69,33 @@ def is_srgb_profile(profile: bytes) -> bool:
     light_difference = np.abs(space.transfer.decode(numbers) - SRGB.transfer.decode(numbers)).max()
     primaries_difference = np.abs(space.to_xyz - SRGB.to_xyz).max()
     return bool(max(light_difference, primaries_difference) < SAME_LIGHT)
+
+
+# Names of HDR profiles, such as "Rec. ITU-R BT.2100 PQ" and "Rec2100HLG".
+_HDR_NAME = re.compile(r"2100\W*(PQ|HLG)\b", re.IGNORECASE)
+_BT2020_CICP = 9
+_CICP_OF_NAME = {"PQ": 16, "HLG": 18}
+
+
+def hdr_space_of_icc(profile: bytes) -> ColorSpace | None:
+    """The colour space of a profile for PQ or HLG; None for any other.
+
+    A profile's curves have no light above white. So a profile for HDR has a tag `cicp`, which says
+    what the numbers are; older ones only have a name.
+    """
+    try:
+        tag = _tags(profile).get(b"cicp", b"")
+        if len(tag) >= 12:
+            # The type (4 bytes), 4 zeros, then the numbers of CICP.
+            primaries, transfer, _, full_range = tag[8:12]
+            space = color_space_of_cicp(primaries, transfer, is_full_range=bool(full_range))
+            return space if space.transfer.is_hdr else None
+    except (struct.error, ValueError):
+        return None
+    name = _HDR_NAME.search(_description(profile))
+    if name is None:
+        return None
+    return color_space_of_cicp(_BT2020_CICP, _CICP_OF_NAME[name[1].upper()])
 
 
 def convert_by_profile(image: Image.Image, profile: bytes) -> Image.Image | None:

@@ -27,6 +27,7 @@ class FileKind:
     pillow: str | None = None  # Pillow's name of the decoder; None: no photo that Pillow reads
     suffixes: tuple[str, ...] = ()  # in lower case; the first one is the usual one
     is_raw: bool = False  # the data of a sensor, with a preview inside
+    is_video: bool = False
 
     @property
     def is_photo(self) -> bool:
@@ -61,6 +62,8 @@ PHOTO_SUFFIXES = tuple(
     suffix for kind in PHOTO_KINDS for suffix in kind.suffixes if suffix != ".pfm"
 )
 
+VIDEO = FileKind("video", is_video=True)
+
 # Formats by their first bytes. The longest ones come first, because some begin alike.
 _MAGIC: tuple[tuple[bytes, FileKind], ...] = (
     (b"FUJIFILMCCD-RAW", RAW),
@@ -75,7 +78,7 @@ _MAGIC: tuple[tuple[bytes, FileKind], ...] = (
     (b"\xc5\xd0\xd3\xc6", FileKind("PostScript")),
     (b"\x76\x2f\x31\x01", FileKind("OpenEXR")),
     (b"\x00\x05\x16\x07", FileKind("AppleDouble")),
-    (b"\x1a\x45\xdf\xa3", FileKind("video")),
+    (b"\x1a\x45\xdf\xa3", VIDEO),  # Matroska and WebM
     (b"II*\x00", TIFF),
     (b"MM\x00*", TIFF),
     (b"II+\x00", TIFF),  # BigTIFF
@@ -122,7 +125,7 @@ def kind_of_bytes(head: bytes) -> FileKind:
         if head.startswith(magic):
             return kind
     if head.startswith(b"RIFF"):
-        return WEBP if head[8:12] == b"WEBP" else FileKind("video or sound")
+        return {b"WEBP": WEBP, b"AVI ": VIDEO}.get(head[8:12], FileKind("RIFF"))
     if head[4:8] == b"ftyp":
         return _kind_of_brands(head)
     # "P6" alone would also fit a text; a space or a comment follows in every file of this kind.
@@ -153,7 +156,7 @@ def _kind_of_brands(head: bytes) -> FileKind:
     is_heif = main_brand in _HEIF_BRANDS
     if is_heif and brands & _AVIF_BRANDS and not brands & {b"heic", b"heix"}:
         return AVIF
-    return HEIF if is_heif else FileKind("video")
+    return HEIF if is_heif else VIDEO
 
 
 def kind_of_file(path: str | os.PathLike[str]) -> FileKind:

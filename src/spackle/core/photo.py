@@ -25,7 +25,7 @@ from spackle.core.image_files import OpenPicture, check_pixel_count, exif_tags, 
 from spackle.core.photo_frame import PhotoFrame, find_frame
 from spackle.core.projections import looks_like_360, refuse_other_projections, xmp_of_image
 from spackle.core.srgb_pictures import SrgbPicture, image_to_srgb, picture_to_srgb
-from spackle.core.stated_colors import read_stated_colors
+from spackle.core.stated_colors import read_colors_of_open_image, read_stated_colors
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.errors import InputError, as_input_error, short_repr
 
@@ -158,11 +158,13 @@ def photo_from_picture(
     exif: Mapping[int, object] = {}
     if isinstance(picture, Image.Image):
         check_pixel_count(picture.width, picture.height, file_bytes=None, path=name)
+        stated = read_colors_of_open_image(picture)
         exif = exif_tags(picture)
         xmp = xmp_of_image(picture, exif)
         refuse_other_projections(name, exif, xmp, picture.width, picture.height)
         with as_input_error(name, "the picture cannot be used: {reason}"):
-            colors = image_to_srgb(picture, read_stated_colors(picture, exif), exif, name)
+            stated = stated or read_stated_colors(picture, exif)
+            colors = image_to_srgb(picture, stated, exif, name)
     else:
         colors = SrgbPicture(_array_to_rgb(plain_array(picture, name), name), ())
     return _make_photo(colors, exif, name, keep_frame, **focal_options)

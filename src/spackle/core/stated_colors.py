@@ -9,11 +9,13 @@ compressed picture. EXIF comes last.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
+import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import BinaryIO
 
 import numpy as np
@@ -36,7 +38,17 @@ from spackle.core.color_spaces import (
 )
 from spackle.core.deep_pictures import bitstream_cicp
 from spackle.core.heif_items import BOX_ERRORS, HeifItems
-from spackle.core.image_formats import AVIF, BMP, HEIF, PNG, TIFF, FileKind
+from spackle.core.icc_profiles import hdr_space_of_icc
+from spackle.core.image_formats import (
+    AVIF,
+    BMP,
+    HEAD_BYTES,
+    HEIF,
+    PNG,
+    TIFF,
+    FileKind,
+    kind_of_bytes,
+)
 from spackle.core.tiff_directories import PREVIEW_COLOR_SPACE
 
 # A gamma of 0.45455 stands in PNGs whose numbers are sRGB; only programs that know nothing about
@@ -84,10 +96,19 @@ def read_stated_colors(
         kind: the format of the file; None for a picture in memory.
         file: the open file; None for a picture in memory, of which only what Pillow keeps is known.
     """
+    stated = _statement_that_counts(image, exif, kind, file)
+    hdr_space = None if stated.icc is None else hdr_space_of_icc(stated.icc)
+    return stated if hdr_space is None else StatedColors(hdr_space)
+
+
+def _statement_that_counts(
+    image: Image.Image,
+    exif: Mapping[int, object],
+    kind: FileKind | None,
+    file: BinaryIO | None,
+) -> StatedColors:
+    """The statement of a file that counts; the arguments are those of `read_stated_colors`."""
     icc = image.info.get("icc_profile") or None
-    cicp_of_icc = None if icc is None else _cicp_of_icc(icc)
-    if cicp_of_icc is not None:
-        return StatedColors(cicp_of_icc)
     if file is None:
         return _colors_in_memory(image, exif, icc)
     if kind is PNG:
@@ -99,6 +120,47 @@ def read_stated_colors(
     if kind is BMP:
         return _bmp_colors(file)
     return _exif_colors(exif, is_tiff=kind is TIFF)
+
+
+def read_colors_of_open_image(image: Image.Image) -> StatedColors | None:
+    """What the file of a picture that Pillow has opened states by CICP, which Pillow does not keep.
+
+    None if it is no PNG or AVIF, its file is not at hand, or states nothing. To be called before
+    its EXIF is read, for which Pillow loads a PNG, and forgets its file.
+    """
+    if image.format not in (PNG.pillow, AVIF.pillow):
+        return None
+    with _file_of(image) as file:
+        if file is None:
+            return None
+        icc = image.info.get("icc_profile") or None
+        if image.format == PNG.pillow:
+            return _png_colors(_png_chunks(file), icc)
+        return None if icc is not None else _heif_colors(file)
+
+
+@contextlib.contextmanager
+def _file_of(image: Image.Image) -> Iterator[BinaryIO | None]:
+    """The file from which Pillow has opened an image, during the block; None if it is not at hand.
+
+    While the image is not loaded, it is open, and is left as it was.
+    """
+    file = getattr(image, "fp", None)
+    if file is not None and not getattr(file, "closed", True):
+        position = file.tell()
+        try:
+            yield file
+        finally:
+            file.seek(position)
+        return
+    name = getattr(image, "filename", "")
+    if not name or not os.path.isfile(name):
+        yield None
+        return
+    with open(name, "rb") as opened:
+        # Another file may have got this name since.
+        is_same_kind = kind_of_bytes(opened.read(HEAD_BYTES)).pillow == image.format
+        yield opened if is_same_kind else None
 
 
 def _colors_in_memory(
@@ -120,29 +182,6 @@ def _colors_in_memory(
     if gamma or numbers:
         return _gamma_colors(float(gamma or 0), numbers)
     return _exif_colors(exif)
-
-
-# --- ICC
-
-
-def _cicp_of_icc(profile: bytes) -> ColorSpace | None:
-    """The HDR colour space that a profile names by numbers of CICP; None without.
-
-    A profile's curves have no light above white. So a profile for PQ or HLG has a tag `cicp`, which
-    says what the numbers are.
-    """
-    try:
-        (count,) = struct.unpack_from(">I", profile, 128)
-        for index in range(min(count, 100)):  # a profile has a dozen tags
-            name, place, size = struct.unpack_from(">4sII", profile, 132 + 12 * index)
-            if name == b"cicp" and size >= 12:
-                # The type (4 bytes), 4 zeros, then the numbers.
-                primaries, transfer, _, full_range = profile[place + 8 : place + 12]
-                space = color_space_of_cicp(primaries, transfer, is_full_range=bool(full_range))
-                return space if space.transfer.is_hdr else None
-    except (struct.error, ValueError):
-        pass
-    return None
 
 
 # --- PNG
