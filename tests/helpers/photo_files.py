@@ -21,6 +21,10 @@ from PIL import Image
 PATCHES = np.array(
     [[200, 60, 40], [60, 180, 70], [40, 60, 200], [128, 128, 128], [230, 230, 230], [20, 20, 20]]
 )
+# Colours that two HDR clips of tests/data/clips hold.
+HDR_CLIP_COLORS = np.array(
+    [[150, 60, 40], [60, 140, 70], [40, 60, 150], [128, 128, 128], [230, 230, 230]]
+)
 SQUARE = 64
 
 
