@@ -193,7 +193,7 @@ def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path,
             "0.0%",
             f"--depth {pair[1]}",
         ),
-        depth: ("depth map", "near 2 m"),
+        depth: ("depth map", "depth, read as millimetres", "near 2 m"),
         clip: ("clip", "24×16", "3, 10 a second", "none", "spackle predict"),
     }
     for path, parts in expected.items():

@@ -123,7 +123,7 @@ def depth_facts(path: Path) -> FactsOfFile:
     return {
         "kind": "depth map",
         "size": f"{width}×{height}",
-        "holds": depth_map.quantity,
+        "holds": f"{depth_map.quantity}, read as {depth_map.meaning}",
         "depth": depth_map.range_in_words,
         "unknown": f"{unknown_ratio:.1%} of the pixels",
         "next": f"spackle predict PHOTO --depth {path}",
