@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import ROOT
-from helpers.photos import write_pair
+from helpers.photos import metres, write_depth, write_pair
 from helpers.scenes import box_before_wall, psnr
 from helpers.web_client import eventually, served
 from PIL import Image
@@ -32,6 +32,7 @@ from spackle.core.trajectories import (
     TrajectoryKind,
     trajectory_cameras,
 )
+from spackle.formats import load_ply
 from spackle.formats.html import PageScene, page_scene, read_page_file, single_html
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
@@ -320,6 +321,8 @@ def drag_moves_the_eye(page: Any) -> None:
 
 def test_a_photo_is_sent_to_the_server_watched_and_dragged(browser: Any, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path / "first")
+    nearest = metres().min()
+    write_depth(depth, 100 * metres())  # in centimetres
     photo = photo.rename(tmp_path / "my photo.png")
     with served(tmp_path / "scenes", work=SceneWork(), max_bytes=MAX_UPLOAD_BYTES) as server:
         address = f"http://127.0.0.1:{server.port}{server.root}/"
@@ -327,12 +330,18 @@ def test_a_photo_is_sent_to_the_server_watched_and_dragged(browser: Any, tmp_pat
         page.get_by_role("button", name="Choose a photo…").click()
         page.locator("summary").click()
         page.locator("[name=depth]").set_input_files(depth)
+        page.locator("[name=depth_kind]").select_option("near-white")
+        assert not page.locator("[name=depth_unit]").is_visible()  # relative depth has no unit
         page.locator("[name=depth_kind]").select_option("metric")
+        page.locator("[name=depth_unit]").fill("cm")
         page.locator("#file").set_input_files(photo)
         page.get_by_role("button", name="Start").click()
         page.locator("#frame.waiting #photo").wait_for()  # the picture stands where the scene will
         page.get_by_role("heading", name="my photo.png").wait_for()
         page.locator("#notice").wait_for(state="hidden")
+        (scene,) = (tmp_path / "scenes").rglob("scene.ply")
+        depths = load_ply(scene).means[:, 2]
+        assert float(depths.quantile(0.01)) == pytest.approx(nearest, rel=0.02)
         drag_moves_the_eye(page)
         for start, name in (
             (lambda: page.locator("#record").click(), "my-photo.mp4"),

@@ -331,7 +331,14 @@ def test_jobs_leave_no_thread_no_file_and_no_memory_behind(server: Served) -> No
     threads, megabytes = done(6)
     files = len(os.listdir("/proc/self/fd"))
     more, now = done(9)
-    assert (more <= threads, now < megabytes + 20) == (True, True), (threads, more, megabytes, now)
+    # The server's pool may start another thread whenever requests overlap on a busy machine. A
+    # leak would leave one for each photo, or at least for each of the three bad ones.
+    assert (more < threads + 3, now < megabytes + 20) == (True, True), (
+        threads,
+        more,
+        megabytes,
+        now,
+    )
 
 
 def png_claiming(width: int, height: int) -> bytes:

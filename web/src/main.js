@@ -135,7 +135,8 @@ function uploads() {
     if (!dialog.open) take();
   };
   start.onclick = take;
-  dialog.querySelector("[name=depth]").onchange = ({ target }) => (element("kind").hidden = !target.files[0]);
+  const elements = dialog.querySelector("form").elements;
+  elements.depth.onchange = elements.depth_kind.onchange = offerReadings;
   const holdsFile = (event) => upload && !working && event.dataTransfer?.types.includes("Files");
   addEventListener("dragover", (event) => {
     event.preventDefault();
@@ -164,12 +165,20 @@ async function example(name) {
   open(new File([photo], name, { type: photo.type }));
 }
 
-/** What the dialog says: {base, disparity, depth, depth_kind}. */
+/** Show how a depth map may be read: its kind, and for distances the unit. */
+function offerReadings() {
+  const { depth, depth_kind: kind } = element("choices").querySelector("form").elements;
+  element("kind").hidden = !depth.files[0];
+  element("unit").hidden = !depth.files[0] || !["", "metric"].includes(kind.value);
+}
+
+/** What the dialog says: {base, disparity, depth, depth_kind, depth_unit}. */
 function choices() {
   const form = element("choices").querySelector("form");
   const said = Object.fromEntries(new FormData(form));
   form.elements.depth.value = ""; // it is of one photo
-  element("kind").hidden = true;
+  if (element("unit").hidden) said.depth_unit = "";
+  offerReadings();
   return said;
 }
 

@@ -52,12 +52,13 @@ export async function fetched(id, name) {
 }
 
 /** Give the server a photo; the id of its scene. */
-export async function send(photo, { base = "", disparity = "", depth = null, depth_kind = "" } = {}) {
+export async function send(photo, { base = "", disparity = "", depth = null, depth_kind = "", depth_unit = "" } = {}) {
   const form = new FormData();
   form.set("photo", photo, photo.name);
   if (depth?.size) form.set("depth", depth, depth.name);
   const options = { files: [], ...(base && { base }), ...(disparity && { disparity: Number(disparity) }) };
   if (depth?.size && depth_kind) options.depth_kind = depth_kind;
+  if (depth?.size && depth_unit) options.depth_unit = depth_unit;
   form.set("options", JSON.stringify(options));
   return (await (await answer(await fetch(here(SCENES), { method: "POST", body: form }))).json()).id;
 }

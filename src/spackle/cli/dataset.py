@@ -11,6 +11,8 @@ from spackle.cli.options import (
     DATASET_BASES,
     INPAINTERS,
     INTERRUPTED,
+    DepthKindOption,
+    DepthUnitOption,
     DeviceOption,
     PrecisionOption,
     SharpTrajectoryName,
@@ -71,6 +73,8 @@ def dataset_build(
         Path | None,
         typer.Option(metavar="FOLDER", help="Depth maps with the photos' names, for --base rgbd."),
     ] = None,
+    depth_kind: DepthKindOption = "auto",
+    depth_unit: DepthUnitOption = None,
     checkpoint: Annotated[
         Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")
     ] = None,
@@ -141,7 +145,13 @@ def dataset_build(
 
     # The base makes the views with holes; the inpainter makes from them what training aims at.
     settings = BaseSettings(
-        name=base, depth=depth, checkpoint=checkpoint, precision=precision, device=device
+        name=base,
+        depth=depth,
+        depth_kind=depth_kind,
+        depth_unit=depth_unit,
+        checkpoint=checkpoint,
+        precision=precision,
+        device=device,
     )
     options = DatasetOptions(
         base=settings,

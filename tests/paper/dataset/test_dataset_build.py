@@ -253,6 +253,28 @@ def test_another_configuration_and_a_held_folder_are_refused(
     refuses(build(place, copy), ".lock: cannot lock: Is a directory")
 
 
+def test_depth_maps_are_read_in_their_unit(place: Path, tmp_path: Path) -> None:
+    for file in (place / "depth").rglob("*.npy"):
+        moved = tmp_path / "depth" / file.relative_to(place / "depth")
+        moved.parent.mkdir(parents=True, exist_ok=True)
+        np.save(moved, 100 * np.load(file))  # centimetres
+    for folder, options in (
+        (place, ["--inpainter", "none"]),
+        (tmp_path, ["--inpainter", "none", "--depth-unit", "cm"]),
+    ):
+        words = ["dataset", "build", place / "photos", "--depth", folder / "depth"]
+        done = run(*words, *SHORT, "--views", 2, "-o", tmp_path / f"out{len(options)}", *options)
+        assert done.code == 0, done.err
+    in_metres, in_centimetres = (DatasetFiles(tmp_path / f"out{count}") for count in (2, 4))
+    for place_in_set in range(len(in_metres)):
+        expected = in_metres[place_in_set].view(1)
+        found = in_centimetres[place_in_set].view(1)
+        torch.testing.assert_close(
+            found.rendering.depth, expected.rendering.depth, rtol=1e-3, atol=0
+        )
+    assert in_centimetres.manifest.config["base"]["depth_unit"] == "cm"
+
+
 def test_sharp_needs_no_depth(made: dict[str, Path], tmp_path: Path) -> None:
     write_inputs(tmp_path, 1, 64, 48)
     weights = made["sharp"]

@@ -155,6 +155,12 @@ def dataset_configuration(
     if code:
         completion["code"] = code
     inputs_digest = json_digest([options.input_digests(photo) for photo in photos])
+    # How the numbers of depth maps were read; what nobody stated is left out.
+    depth_reading: dict[str, Any] = {}
+    if base.depth_kind != "auto":
+        depth_reading["depth_kind"] = base.depth_kind
+    if base.depth_unit is not None:
+        depth_reading["depth_unit"] = base.depth_unit
     return {
         "spackle": spackle.__version__,
         "photos": {
@@ -168,6 +174,7 @@ def dataset_configuration(
             "weights": weights_digests(base.model_files),
             "precision": base.precision,
             "device": base.device,
+            **depth_reading,
         },
         "views": {
             "seed": options.seed,
