@@ -202,7 +202,7 @@ class ToSplat:
         from comfy_api.latest import Types  # ComfyUI's own
 
         means, quats, scales, opacities, colors = (
-            t.detach().float().cpu() for t in scene.gaussians.tensors
+            t.detach().float().cpu() for t in scene.gaussians.with_harmonics_count(0).tensors
         )
         harmonics = (linear_to_srgb(colors) - 0.5) / SH_C0
         quats = torch.nn.functional.normalize(quats, dim=-1)

@@ -202,3 +202,9 @@ def motorcycle() -> Stereo:
 @functools.cache
 def motorcycle_base() -> BasePrediction:
     return motorcycle().left.lift()
+
+
+def random_harmonics(count: int, degree: int, seed: int = 5) -> Tensor:
+    """Coefficients [count, 3 | 8 | 15, 3] of about ±0.3 for the degrees 1 to `degree`."""
+    generator = torch.Generator().manual_seed(seed)
+    return 0.3 * torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=generator)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import gsplat_stand_in
-from helpers.scenes import box_before_wall, same_bits, shifted
+from helpers.scenes import box_before_wall, random_harmonics, same_bits, shifted
 
 from spackle.core.gaussians import Gaussians
 from spackle.render import CpuRenderer, get_renderer
@@ -107,6 +107,29 @@ def test_gradients_match_the_cpu_renderer(gpu: GsplatRenderer) -> None:
         found.append(torch.autograd.grad(loss, asking.tensors))
     for one, other in zip(*found, strict=True):
         assert float((one - other).norm() / other.norm()) < 0.02
+
+
+def test_harmonics_match_the_cpu_renderer(gpu: GsplatRenderer) -> None:
+    small = box_before_wall(width=24, height=20, focal=22)
+    base = small.base()
+    base = dataclasses.replace(base, harmonics=0.5 * random_harmonics(len(base), 3))
+    cameras = [small.camera, shifted(small.camera, 0.4)]
+    for camera, view in zip(cameras, gpu.render_batch([[base], [base]], cameras), strict=True):
+        agree(view, CPU.render(base, camera))
+        plain = CPU.render(base.with_harmonics_count(0), camera)
+        assert float((view.rgb - plain.rgb).abs().mean()) > 0.02
+    weights = torch.rand(20, 24, 3, generator=torch.Generator().manual_seed(0))
+    gradients = []
+    for renderer in (gpu, CPU):
+        leaf = Gaussians(*(t.clone().requires_grad_() for t in base.tensors))
+        loss = (renderer.render(leaf, cameras[1]).rgb * weights).sum()
+        gradients.append(torch.autograd.grad(loss, leaf.tensors))
+    for one, other in zip(*gradients, strict=True):
+        assert float((one - other).norm() / other.norm()) < 0.02
+    assert base.harmonics is not None
+    base.harmonics[7, 2, 1] = torch.nan
+    left = base.select(torch.arange(len(base)) != 7)
+    assert same_bits(gpu.render(base, cameras[1]), gpu.render(left, cameras[1]))
 
 
 def test_only_wanted_tiles_change(gpu: GsplatRenderer) -> None:

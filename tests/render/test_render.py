@@ -8,7 +8,7 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 import torch
-from helpers.scenes import random_scene, same_bits, turned_camera
+from helpers.scenes import random_harmonics, random_scene, same_bits, turned_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -216,17 +216,17 @@ def test_bad_tiles_and_devices_are_refused():
 
 @st.composite
 def scenes(draw: st.DrawFn) -> tuple[Gaussians, Camera, float, float]:
-    """Gaussians, a camera, eps2d, and the share of opaque Gaussians."""
+    """Gaussians with or without harmonics, a camera, eps2d, and the share of opaque Gaussians."""
     camera = turned_camera(
         draw(st.integers(1, 50)), draw(st.integers(1, 50)), draw(st.floats(20, 90))
     )
     solidity, eps2d = draw(st.sampled_from([1.0, 10.0])), draw(st.sampled_from([0.0, 0.3]))
-    return (
-        random_scene(draw(SEEDS), draw(st.integers(1, 80)), camera, solidity),
-        camera,
-        eps2d,
-        solidity,
-    )
+    gaussians = random_scene(draw(SEEDS), draw(st.integers(1, 80)), camera, solidity)
+    degree = draw(st.sampled_from([0, 0, 1, 2, 3]))
+    if degree:
+        harmonics = random_harmonics(len(gaussians), degree, draw(SEEDS))
+        gaussians = dataclasses.replace(gaussians, harmonics=harmonics)
+    return gaussians, camera, eps2d, solidity
 
 
 def held_to_the_twin(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
@@ -291,7 +291,8 @@ def test_gradients_match_the_reference(scene):
             for w in weights
         ]
         gradients.append([torch.stack(column).double() for column in zip(*rows, strict=True)])
-    for name, found, expected in zip(vars(gaussians), *gradients, strict=True):
+    names = [name for name, tensor in vars(gaussians).items() if tensor is not None]
+    for name, found, expected in zip(names, *gradients, strict=True):
         scale = float(expected.abs().max())
         torch.testing.assert_close(
             found, expected, rtol=1e-4, atol=1e-4 * scale, msg=lambda m, n=name: n + m
@@ -400,6 +401,26 @@ def test_gradients_of_tiles():
     (full.rgb[mask].sum() + full.depth[mask].sum() + full.alpha[mask].sum()).backward()
     for one, other in zip(leaf.tensors, twin.tensors, strict=True):
         torch.testing.assert_close(one.grad, other.grad)
+
+
+def test_colours_change_with_the_view_and_with_nothing_else():
+    camera = turned_camera(60, 50, 50.0)
+    plain = random_scene(8, 300, camera)
+    colourful = dataclasses.replace(plain, harmonics=random_harmonics(300, 3))
+    aux = random_scene(9, 20, camera)
+    one, other = CPU.render(plain, camera), CPU.render(colourful, camera)
+    assert torch.equal(one.alpha, other.alpha)
+    assert torch.equal(one.depth, other.depth)
+    assert float((one.rgb - other.rgb).abs().max()) > 0.1
+    # Joined to others, which get coefficients of 0, a Gaussian has the same bits.
+    together = CPU.render(Gaussians.cat([colourful, aux]), camera)
+    assert same_bits(CPU.render([colourful, aux], camera), together)
+    assert same_bits(CPU.render(plain.with_harmonics_count(15), camera), one)
+    # A coefficient that is not finite hides its Gaussian, as another such number does.
+    colourful.harmonics[5, 7, 1] = torch.nan
+    assert same_bits(
+        CPU.render(colourful, camera), CPU.render(colourful.select(torch.arange(300) != 5), camera)
+    )
 
 
 def test_results_do_not_depend_on_the_number_of_threads():

@@ -7,7 +7,9 @@ from collections.abc import Iterable
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
+
+from spackle.core.spherical_harmonics import HARMONICS_COUNTS, rotate_harmonics
 
 ROTATION_TOLERANCE = 1e-5  # error of R Rᵀ at which a matrix is still a rotation
 
@@ -23,7 +25,11 @@ class Gaussians:
     quats: Tensor  # [N, 4] rotation as (w, x, y, z); need not be normalised
     scales: Tensor  # [N, 3] standard deviations along the rotated axes
     opacities: Tensor  # [N] in 0..1
-    colors: Tensor  # [N, 3] linear RGB
+    # [N, 3] linear RGB; with harmonics that of their constant part, which may be outside of 0..1
+    colors: Tensor
+    # [N, 3 | 8 | 15, 3] coefficients of the spherical harmonics of the degrees 1 to 1, 2 or 3, in
+    # sRGB, as 3D Gaussian splatting orders them; None: colours do not change with the view.
+    harmonics: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Raise a ValueError for tensors of a wrong shape."""
@@ -39,6 +45,12 @@ class Gaussians:
             shape = tuple(getattr(self, name).shape)
             if shape != expected_shape:
                 raise ValueError(f"Gaussians.{name} has shape {shape}, expected {expected_shape}")
+        if self.harmonics is None:
+            return
+        shape = tuple(self.harmonics.shape)
+        possible_shapes = [(count, k, 3) for k in HARMONICS_COUNTS[1:]]
+        if shape not in possible_shapes:
+            raise ValueError(f"Gaussians.harmonics has shape {shape}, expected ({count}, 15, 3)")
 
     def __len__(self) -> int:
         return len(self.means)
@@ -47,9 +59,15 @@ class Gaussians:
         return f"Gaussians({len(self):,}, {self.means.device})"
 
     @property
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The five tensors in the order of the fields."""
-        return self.means, self.quats, self.scales, self.opacities, self.colors
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The five tensors in the order of the fields, and the harmonics if there are any."""
+        always = (self.means, self.quats, self.scales, self.opacities, self.colors)
+        return always if self.harmonics is None else (*always, self.harmonics)
+
+    @property
+    def harmonics_count(self) -> int:
+        """The number of harmonics of a colour: 0, 3, 8 or 15 for the degrees 0 to 3."""
+        return 0 if self.harmonics is None else self.harmonics.shape[1]
 
     @staticmethod
     def empty(device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -64,9 +82,29 @@ class Gaussians:
 
     @staticmethod
     def cat(parts: Iterable[Gaussians]) -> Gaussians:
-        """Join sets in the given order, without changing a bit."""
+        """Join sets in the given order, without changing a bit.
+
+        Where one set has harmonics of a higher degree than another, the other gets zeros.
+        """
+        parts = list(parts)
+        count = max((part.harmonics_count for part in parts), default=0)
+        parts = [part.with_harmonics_count(count) for part in parts]
         tensors_of_fields = zip(*(part.tensors for part in parts), strict=True)
         return Gaussians(*(torch.cat(tensors) for tensors in tensors_of_fields))
+
+    def with_harmonics_count(self, count: int) -> Gaussians:
+        """The same Gaussians with 0, 3, 8 or 15 harmonics: zeros are added, or the last dropped."""
+        if count == self.harmonics_count:
+            return self
+        if count == 0:
+            return dataclasses.replace(self, harmonics=None)
+        harmonics = self.harmonics
+        if harmonics is None:
+            harmonics = self.colors.new_zeros(len(self), 0, 3)
+        missing = max(0, count - harmonics.shape[1])
+        # Pairs from the last axis on: no colour is added, but rows of harmonics at the end.
+        padded = pad(harmonics[:, :count], (0, 0, 0, missing))
+        return dataclasses.replace(self, harmonics=padded)
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
@@ -89,6 +127,8 @@ class Gaussians:
     def transform(self, matrix: Tensor) -> Gaussians:
         """Apply a similarity [4, 4]: rotation, uniform scale and translation.
 
+        Colours that change with the view turn together with the scene.
+
         Raises:
             ValueError: the upper left 3×3 block is not a proper rotation times a scale.
         """
@@ -110,7 +150,11 @@ class Gaussians:
         dtype = self.means.dtype
         means = (self.means.double() @ linear.T + translation).to(dtype)
         quats = quat_multiply(quat_from_matrix(rotation), self.quats.double()).to(dtype)
-        return Gaussians(means, quats, self.scales * scale.to(dtype), self.opacities, self.colors)
+        harmonics = self.harmonics
+        if harmonics is not None:
+            harmonics = rotate_harmonics(harmonics, rotation)
+        scales = self.scales * scale.to(dtype)
+        return Gaussians(means, quats, scales, self.opacities, self.colors, harmonics)
 
     @property
     def finite(self) -> bool:

@@ -51,8 +51,9 @@ class GaussianColumns:
         Raises:
             ValueError: a value is not finite; only scales may be infinite.
         """
-        gaussians = gaussians.detach().to("cpu", torch.float32)
-        for name, tensor in vars(gaussians).items():
+        gaussians = gaussians.detach().to("cpu", torch.float32).with_harmonics_count(0)
+        names = ("means", "quats", "scales", "opacities", "colors")
+        for name, tensor in zip(names, gaussians.tensors, strict=True):
             # An infinite scale is allowed, because it is clamped below; NaN is not.
             checked = tensor.clamp(-1, 1) if name == "scales" else tensor
             if not torch.isfinite(checked).all():

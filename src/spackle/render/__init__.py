@@ -4,7 +4,8 @@ Read `protocol.py` first: it says what a renderer takes and returns. `reference.
 renderer, and slow: it is the formula. `cpu.py` and `gsplat_backend.py` are those that people use.
 The CPU's work is divided so: `project.py` (Gaussians become ellipses in the image), `tile_lists.py`
 (which tile shows which Gaussians), `blend.py` (pixels), `drawing.py` (these three in a row),
-`gradients.py` (the way back). `screen_blend.py` blends ellipses that are given in the image.
+`gradients.py` (the way back). Before it, `view_colors.py` gives Gaussians the colours that the
+camera sees. `screen_blend.py` blends ellipses that are given in the image.
 """
 
 import logging

@@ -13,6 +13,7 @@ from spackle.render.drawing import draw, tiles_to_draw
 from spackle.render.gradients import draw_with_gradients
 from spackle.render.project import KernelCamera
 from spackle.render.protocol import Renderer, Rendering, as_sets, near_plane
+from spackle.render.view_colors import as_seen
 
 
 class CpuRenderer(Renderer):
@@ -42,6 +43,7 @@ class CpuRenderer(Renderer):
         sets = as_sets(gaussians)
         view = KernelCamera.of(camera, eps2d, near_plane(sets, camera))
         drawn_tiles = tiles_to_draw(view, tiles)
+        sets = [as_seen(part, camera) for part in sets]
 
         # If all tiles are drawn, nothing is left of a previous rendering, not even a gradient.
         background = None if tiles is None else previous_rendering

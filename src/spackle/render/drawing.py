@@ -58,7 +58,7 @@ def draw(
     """Draw sets of Gaussians into some tiles of an image.
 
     Args:
-        sets: drawn together as if they were one set.
+        sets: drawn together as if they were one set; without harmonics.
         view: the camera.
         drawn_tiles: [rows, columns] bool: the tiles of 16×16 pixels to draw.
         background: a rendering whose copy fills all other tiles; None: they are black and empty.
@@ -99,9 +99,11 @@ def blank_images(view: KernelCamera, background: Rendering | None, keep_linear: 
 
 def touched_tiles(gaussians: Gaussians | Sequence[Gaussians], camera: Camera) -> Tensor:
     """[ceil(H/16), ceil(W/16)] bool: tiles with pixels that these Gaussians can change."""
+    # Colours, which may change with the view, do not matter.
+    sets = [part.with_harmonics_count(0) for part in as_sets(gaussians)]
     # Drawn together with others, they may have a nearer near plane than alone.
     view = KernelCamera.of(camera, eps2d=0.0, near=MIN_NEAR_PLANE)
-    _, lists = project_and_list(as_sets(gaussians), view, tiles_to_draw(view, None))
+    _, lists = project_and_list(sets, view, tiles_to_draw(view, None))
     list_lengths = np.diff(lists.starts)
     return torch.from_numpy(list_lengths > 0).reshape(view.tiles)
 
@@ -120,7 +122,8 @@ def project_and_list(
 def project(sets: Sequence[Gaussians], view: KernelCamera, drawn_tiles: Array) -> Splats:
     """Project the Gaussians of all sets; those that touch a drawn tile get a record for blending.
 
-    `drawn_tiles` is [rows, columns] bool.
+    `drawn_tiles` is [rows, columns] bool. The sets have no harmonics: their colours are those that
+    the camera sees.
     """
     count = sum(len(part) for part in sets)
     drawn_before = count_drawn_tiles(drawn_tiles)

@@ -44,7 +44,7 @@ def draw_with_gradients(
     """Draw sets of Gaussians, so that gradients reach their tensors and the background.
 
     Args:
-        sets: drawn together as if they were one set.
+        sets: drawn together as if they were one set; without harmonics.
         view: the camera.
         drawn_tiles: [rows, columns] bool: the tiles of 16×16 pixels to draw.
         background: a rendering whose copy fills all other tiles; None: they are black and empty.

@@ -25,6 +25,7 @@ from spackle.render.protocol import (
     paste,
     tile_grid,
 )
+from spackle.render.view_colors import seen_colors
 from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error
 
@@ -41,6 +42,7 @@ class DeviceGaussians:
     covariances: Tensor  # [N, 6]: xx, xy, xz, yy, yz, zz
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3] linear RGB
+    harmonics: Tensor | None  # [N, K, 3], by which the view changes the colours
 
     @staticmethod
     def of(gaussians: Gaussians, device: torch.device) -> DeviceGaussians:
@@ -50,20 +52,30 @@ class DeviceGaussians:
         ]
         finite_by_field = []
         for field in fields:
-            is_finite = field.detach().isfinite()  # [N], or [N, k] for a field with k numbers
-            if is_finite.ndim == 2:
-                is_finite = is_finite.all(1)  # [N]
+            is_finite = field.detach().isfinite()  # [N, ...], a Gaussian's numbers on all axes
+            if is_finite.ndim > 1:
+                is_finite = is_finite.flatten(1).all(1)  # [N]
             finite_by_field.append(is_finite)
         finite = torch.stack(finite_by_field).all(0)
         cleaned = Gaussians(
             *(
-                torch.where(finite if field.ndim == 1 else finite[:, None], field, 0)
+                torch.where(finite.reshape(-1, *[1] * (field.ndim - 1)), field, 0)
                 for field in fields
             )
         )
         return DeviceGaussians(
-            cleaned.means, upper_covariances(cleaned), cleaned.opacities, cleaned.colors
+            means=cleaned.means,
+            covariances=upper_covariances(cleaned),
+            opacities=cleaned.opacities,
+            colors=cleaned.colors,
+            harmonics=cleaned.harmonics,
         )
+
+    def colors_seen_by(self, camera: Camera) -> Tensor:
+        """Linear RGB [N, 3] as a camera sees it."""
+        if self.harmonics is None:
+            return self.colors
+        return seen_colors(self.means, self.colors, self.harmonics, camera)
 
 
 def upper_covariances(gaussians: Gaussians) -> Tensor:
@@ -325,7 +337,7 @@ class GsplatRenderer(Renderer):
                         depths=depths[0],
                         conics=conics[0],
                         opacities=uploaded.opacities,
-                        colors=uploaded.colors,
+                        colors=uploaded.colors_seen_by(cameras[view]),
                     )
                 )
         if not parts:

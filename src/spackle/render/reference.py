@@ -10,6 +10,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_to_matrix
+from spackle.core.view_colors import view_colors
 from spackle.render.protocol import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -62,9 +63,9 @@ def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """The finite Gaussians at or beyond the near plane, sorted by their depth z."""
     finite_by_field = []
     for tensor in gaussians.tensors:
-        is_finite = tensor.detach().isfinite()  # [N], or [N, k] for a field with k numbers
-        if is_finite.ndim == 2:
-            is_finite = is_finite.all(dim=1)  # [N]
+        is_finite = tensor.detach().isfinite()  # [N, ...], the numbers of a Gaussian along all axes
+        if is_finite.ndim > 1:
+            is_finite = is_finite.flatten(1).all(dim=1)  # [N]
         finite_by_field.append(is_finite)
     finite = torch.stack(finite_by_field).all(dim=0)
     z = camera.to_camera(gaussians.means.detach())[:, 2]
@@ -91,8 +92,12 @@ def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(after) else after
     weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, 0)
 
+    colors = gaussians.colors
+    if gaussians.harmonics is not None:
+        colors = view_colors(gaussians.means, colors, gaussians.harmonics, camera.position)
+
     alpha = weights.sum(dim=0)  # [H, W]
-    color = torch.einsum("nhw,nc->hwc", weights, gaussians.colors)
+    color = torch.einsum("nhw,nc->hwc", weights, colors)
     z = camera.to_camera(gaussians.means)[:, 2]
     depth = torch.einsum("nhw,n->hw", weights, z) / torch.where(alpha > 0, alpha, 1)
     return Rendering(linear_to_srgb(color), depth, alpha)
