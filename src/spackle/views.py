@@ -145,7 +145,7 @@ class PathOptions:
         Views of odd width or height grow by one pixel, because video needs even sides.
 
         Args:
-            depth_range: the scene's depths; the nearer it is, the shorter the trajectory.
+            depth_range: the scene's depths; the nearer the scene, the shorter the trajectory.
             camera: the photo's camera.
             keyframes: the keyframes of `path`; None: follow the trajectory.
             disparity: size of the camera's movement if the option `disparity` is not given; None:
@@ -215,8 +215,9 @@ class GivenPath:
     def with_lens(self, photo: Photo) -> Photo:
         """The photo with the focal length that the file of cameras gives, if it names the photo.
 
-        A focal length that the user gives stays. So does that of a photo without its uniform frame,
-        or with other proportions than the file says: it may have been cropped since.
+        A focal length that the user gives is kept. The file's focal length is not taken either for
+        a photo that was cropped since: one whose uniform frame was cut off, or which has other
+        proportions than the file says.
         """
         cameras = self.cameras or self.path_cameras
         lens = None if cameras is None else cameras.lens_of(photo.path.name)
@@ -459,8 +460,8 @@ def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathVie
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
     # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other
-    # programs show the scene without it. So the fill works on frames with a margin, in which they
-    # show as much as the photo's own lens.
+    # programs show the scene without this zoom. So frames are filled with a margin around them, of
+    # the width that the zoom has cut off: together they show as much as the photo's own lens.
     filled_margin_px = (
         math.ceil(path.overscan * camera.width / 2),
         math.ceil(path.overscan * camera.height / 2),

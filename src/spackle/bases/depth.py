@@ -55,7 +55,7 @@ class RgbdBase:
         stretch = self.depth.stretch_to(framed_height, framed_width)
         if abs(stretch) > ASPECT_TOLERANCE:
             notes["depth_stretched"] = round(abs(stretch), 4)
-        # A unit that was only guessed decides nothing.
+        # A scene whose unit was only guessed does not count as metric.
         return dataclasses.replace(
             prediction, notes=notes, lens_source=lens_source, is_metric=not depth.is_guess
         )

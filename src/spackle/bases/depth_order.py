@@ -30,9 +30,12 @@ def depth_order_agreement(depth: DepthMap, photo: Photo) -> float:
     1: the same order, from near to far, as a small network (lite) guesses; -1: the opposite order;
     0: no connection, or nothing to compare.
     """
-    # A map that belongs to a larger picture than this photo cannot be compared pixel by pixel.
+    # A border was cropped from a photo with a frame. Its map has the border still, so the two
+    # cannot be compared pixel by pixel.
     if photo.frame is not None or not SHIPPED_WEIGHTS.is_file():
         return 0.0
+
+    # The network guesses inverse depth, which is large where the photo is near.
     outputs = _load_lite().at_scales(photo.rgb, COMPARED_SCALES)
     gives_low_frequencies = [scale.gives_low_frequencies for scale in COMPARED_SCALES]
     farness = -merge_outputs(outputs, gives_low_frequencies)
@@ -50,8 +53,12 @@ def _load_lite() -> LiteBase:
 
 
 def _sampled(values: Tensor) -> Array:
-    """48×64 values of a map [H, W], evenly spread, as an array."""
+    """48×64 values of a map [H, W], evenly spread, as an array.
+
+    The same points of the picture are taken from a map of any size.
+    """
     height, width = values.shape
+    # 0.5: the middles of 48 rows and 64 columns of equal parts.
     rows = ((torch.arange(SAMPLE_ROWS) + 0.5) / SAMPLE_ROWS * height).long()
     columns = ((torch.arange(SAMPLE_COLUMNS) + 0.5) / SAMPLE_COLUMNS * width).long()
     sampled: Array = values[rows][:, columns].numpy()
@@ -68,8 +75,9 @@ def rank_correlation(first: Array, second: Array) -> float:
 
 def _centred_ranks(values: Array) -> Array:
     """The ranks [N] of values, minus their mean; equal values share the mean of their ranks."""
-    _, group, sizes = np.unique(values, return_inverse=True, return_counts=True)
-    last_rank = np.cumsum(sizes)
-    mean_rank = last_rank - (sizes - 1) / 2
-    ranks: Array = mean_rank[group]
+    # Equal values are a group, and groups are numbered from the least value upwards.
+    _, group_of_value, group_sizes = np.unique(values, return_inverse=True, return_counts=True)
+    last_rank = np.cumsum(group_sizes)  # of each group
+    mean_rank = last_rank - (group_sizes - 1) / 2
+    ranks: Array = mean_rank[group_of_value]
     return ranks - float(ranks.mean())

@@ -196,6 +196,7 @@ def read_depth(
         source = find_depth_file(source, photo.path)
 
     def load(kind: DepthKind) -> DepthMap:
+        """The map, if its numbers mean `kind`, such as metric or inverse depth."""
         return load_depth(
             source,
             focal_px=focal_px,

@@ -307,7 +307,10 @@ def _predict_all(
         # A folder with one photo is not a single photo: the next run may find more in it.
         is_single_photo = len(sources) == len(photos) == 1 and not sources[0].is_dir()
         return predict_photos(
-            *(photos, output, options, reporter),
+            photos,
+            output,
+            options,
+            reporter,
             is_single=is_single_photo,
             left_out=left_out,
         )

@@ -12,7 +12,7 @@ import math
 import os
 import zipfile
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 from PIL import Image
@@ -202,18 +202,21 @@ def read_stored_depth(source: StrPath | DepthValue, *, grey: bool = False) -> St
 
 def _stored_depth_of_value(source: DepthValue, grey: bool) -> StoredDepth:
     """The numbers [H, W] of a map that a program holds, and its mask; see `read_stored_depth`."""
-    value, path = source.value, source.path
+    value = source.value
+    path = source.path
     if isinstance(value, Image.Image) and value.mode != "F":
         with as_input_error(path, "the picture cannot be used ({reason}): give another one"):
             return StoredDepth(_grey_values(value, path, grey), path, is_picture=True)
 
     plain = plain_array(value, path)
     numbers = without_unit_axes(plain.numbers, 2)
-    # Relative depth as a picture with channels, as OpenCV reads a grey file.
+    # Relative depth as a picture with three or four channels, as OpenCV reads a grey file. The
+    # channels may differ a little, as those of a JPEG do; the fourth is opacity.
     if grey and numbers.ndim == 3 and numbers.shape[-1] in (3, 4):
         channels = numbers[..., :3].astype(np.float64)
-        largest = np.abs(channels).max() if channels.size else 0
-        if np.ptp(channels, axis=-1).max(initial=0) > MAX_CHANNEL_DIFFERENCE / 255 * largest:
+        largest = np.abs(channels).max(initial=0)
+        largest_difference = np.ptp(channels, axis=-1).max(initial=0)
+        if largest_difference > MAX_CHANNEL_DIFFERENCE / 255 * largest:
             raise InputError(f"{path}: {NOT_GREY}")
         numbers = numbers[..., 1]
     _check_shape(numbers.shape, path, file_bytes=None)
@@ -254,7 +257,9 @@ def _grey_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
     if image.mode.startswith("I"):
         numbers = np.asarray(image)
         fits_16_bits = numbers.min() >= 0 and numbers.max() <= np.iinfo(np.uint16).max
-        return numbers.astype(np.uint16 if fits_16_bits else numbers.dtype.newbyteorder("="))
+        if fits_16_bits:
+            return numbers.astype(np.uint16)
+        return numbers.astype(numbers.dtype.newbyteorder("="))  # the byte order of this machine
     if not grey:
         raise UnclearDepth.of(f"{path}: a picture with mode {image.mode} holds no millimetres")
 
@@ -278,15 +283,18 @@ def _read_npy(file: IO[bytes], path: StrPath) -> Array:
         shape, is_fortran, dtype = np.lib.format.read_array_header_2_0(start)
     if dtype.kind not in "fiu":
         raise InputError(f"{path}: an array of {dtype} is not a depth map: give float32 metres")
-    # A network's output may have further axes of length 1.
+    # A network's output may have further axes of length 1. What remains without them is seen from
+    # an array of this shape that takes no memory, because all its elements are the same 0.
     map_shape = without_unit_axes(np.broadcast_to(0, shape), 2).shape
     _check_shape(map_shape, path, os.path.getsize(path))
 
     # Only the bytes that the shape needs are read: `frombuffer` fails if the file has fewer.
     count = math.prod(shape)
     content = start.read() + file.read(count * dtype.itemsize)
-    values = np.frombuffer(content, dtype, count).reshape(shape, order="F" if is_fortran else "C")
+    order: Literal["F", "C"] = "F" if is_fortran else "C"  # columns or rows come first
+    values = np.frombuffer(content, dtype, count).reshape(shape, order=order)
     values = values.reshape(map_shape)
+    # The byte order of this machine.
     return np.ascontiguousarray(values, dtype.newbyteorder("="))
 
 

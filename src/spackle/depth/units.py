@@ -83,6 +83,7 @@ def parse_depth_unit(unit: str | float) -> DepthUnit:
     A text is m, cm, mm or km; a number or fraction of metres, such as 0.001 or 1/256; both
     together, such as "0.1 mm"; or 1/m for inverse depth. InputError for other texts.
     """
+    # Nine digits tell any two numbers of float32 apart, and 0.001 stays "0.001".
     text = f"{unit:.9g}" if isinstance(unit, int | float) else unit.strip()
     if text == INVERSE_METRES:
         return DepthUnit(1.0, is_inverse=True, name="inverse metres")

@@ -112,8 +112,8 @@ class ViewCompletion:
     def chosen_cells(self, choice: CellChoice) -> Tensor:
         """[h, w] bool: the cells of 2×2 pixels that get an aux Gaussian.
 
-        Training and evaluation ask here. "masked": the cells in holes, and at least 64 ("Training
-        Details"); "all": every cell.
+        Training and evaluation both call this function, so that they agree. "masked": the cells in
+        holes, and at least 64 (the paper's "Training Details"); "all": every cell.
         """
         if choice == "all":
             return torch.ones_like(self.mask)

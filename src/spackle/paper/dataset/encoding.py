@@ -141,8 +141,8 @@ def decode_gaussians(data: bytes) -> Gaussians:
     """
     arrays = load(data)
     low, high = arrays["scale_logs"].tolist()
-    # What each of the 65,536 codes means. Looking codes up takes far less time than millions of
-    # exponentials, and training decodes a photo's Gaussians for each view.
+    # The scale that each of the 65,536 codes of 16 bits means. Looking codes up takes far less time
+    # than millions of exponentials, and training decodes a photo's Gaussians for each view.
     fractions = np.arange(MAX_CODE + 1) / MAX_CODE
     scale_of_code = np.exp(low + fractions * max(high - low, MIN_RANGE)).astype(np.float32)
     columns = (

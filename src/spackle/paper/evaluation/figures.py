@@ -234,9 +234,14 @@ def _draw_figure(
 
 
 def _share_rows(image_counts: Sequence[int], max_rows: int) -> list[int]:
-    """The number of rows of each evaluation, which has so many images: at least one, if it can.
+    """How many rows of a figure each evaluation gets; a row shows one image.
 
-    Evaluations take turns to get one row more, until there are `max_rows` or no more images.
+    Each evaluation that has images gets at least one row. Then evaluations take turns to get one
+    row more, until the figure has `max_rows` or all images are shown.
+
+    Args:
+        image_counts: the number of images that each evaluation has.
+        max_rows: the most rows of all evaluations together, if this leaves one for each.
     """
     row_counts = [min(1, count) for count in image_counts]
     while sum(row_counts) < max_rows:
@@ -245,7 +250,7 @@ def _share_rows(image_counts: Sequence[int], max_rows: int) -> list[int]:
         ]
         if not open_indices:
             break
-        # Those with the fewest rows come first.
+        # It is the turn of the evaluation with the fewest rows.
         row_counts[min(open_indices, key=lambda index: row_counts[index])] += 1
     return row_counts
 

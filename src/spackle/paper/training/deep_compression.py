@@ -49,7 +49,9 @@ def read_deep_compression(
         as_input_error(path, f"not a network of Deep Compression ({{reason}}): {advice}"),
         open(path, "rb") as file,
     ):
+        # Weights that are 0 are not stored; each layer has a number of those that are.
         stored_counts = _read(file, np.dtype("<u4"), layer_count)
+        # A layer has a table of the values that its weights share, its biases, and its weights.
         for (name, shape), stored_count in zip(shapes.items(), stored_counts, strict=False):
             table = _read(file, np.dtype("<f4"), TABLE_SIZE)
             arrays[f"{name}.b"] = _read(file, np.dtype("<f4"), shape[0])
@@ -58,20 +60,29 @@ def read_deep_compression(
 
 
 def _read_weights(file: BinaryIO, table: Array, shape: Shape, stored_count: int) -> Array:
-    """A layer's weights; ValueError if they do not fit into the shape."""
-    value_numbers = _read(file, np.dtype("u1"), stored_count)
+    """A layer's weights, float32, in the given shape; ValueError if they do not fit into it.
+
+    Args:
+        file: open where the layer's weights begin.
+        table: [256] the values that weights may have.
+        shape: of the result.
+        stored_count: how many weights the file has; all others are 0.
+    """
+    value_numbers = _read(file, np.dtype("u1"), stored_count)  # which value of the table
     pairs = _read(file, np.dtype("u1"), (stored_count + 1) // 2)
-    # Each byte has two numbers of zeros; the last half byte may be unused.
+    # How many zeros come before each stored weight. A byte has two such numbers, the lower half
+    # first; the last half byte may be unused.
     zeros_before = np.stack([pairs % 16, pairs // 16], axis=-1).ravel()[:stored_count]
 
+    # Each stored weight lies one place behind its zeros, and these behind the weight before.
     places = np.cumsum(zeros_before.astype(np.int64) + 1) - 1
     weight_count = int(np.prod(shape))
     if stored_count > 0 and places[-1] >= weight_count:
         raise ValueError("too many weights in a layer")
-    # Value 0 of the table is that of the weights that are not stored.
-    numbers = np.zeros(weight_count, np.uint8)
-    numbers[places] = value_numbers
-    return np.asarray(table[numbers].reshape(shape))
+    # Weights that are not stored have the first value of the table, which is 0.
+    value_number_of_weight = np.zeros(weight_count, np.uint8)
+    value_number_of_weight[places] = value_numbers
+    return np.asarray(table[value_number_of_weight].reshape(shape))
 
 
 def _read(file: BinaryIO, dtype: np.dtype[Any], count: int) -> Array:

@@ -149,6 +149,7 @@ def render_views_of_photo(
     with report_memory_shortage("try optim.precision=bf16"):
         encoded = base.encode(views[0].photo, photo_camera)
         gaussians = base.gaussians(decoder, encoded, renderer.device)
+        # The Gaussians are in SHARP's normalised space, so the cameras are brought there.
         renderings = [
             renderer.render(gaussians, normalised_camera(view.camera, photo_camera))
             for view in views
@@ -157,8 +158,8 @@ def render_views_of_photo(
         (rendering, view.rendering.rgb, target_of(view), view.mask)
         for rendering, view in zip(renderings, views, strict=True)
     ]
-    photo_places = [place for place, view in enumerate(views) if is_photos_view(view)]
-    return ViewBatch.of(images, fully_supervised=photo_places)
+    photos_views = [index for index, view in enumerate(views) if is_photos_view(view)]
+    return ViewBatch.of(images, fully_supervised=photos_views)
 
 
 def is_photos_view(view: DatasetView) -> bool:

@@ -74,20 +74,21 @@ class ViewBatch:
         Args:
             images: four things for each view, in this order: the rendering of the completed view,
                 sRGB [H, W, 3] of the base alone, the target [H, W, 3], and the hole [H, W] bool.
-            fully_supervised: places of the views in which the target counts in every pixel; in the
-                others it counts in the hole.
+            fully_supervised: indices of the views in which the target counts in every pixel; in
+                the others it counts in the hole.
         """
-        views = list(images)
-        device = views[0][0].rgb.device
-        holes = torch.stack([hole.to(device) for _, _, _, hole in views])
+        renderings, base_images, targets, hole_masks = zip(*images, strict=True)
+        device = renderings[0].rgb.device
+        holes = torch.stack([hole.to(device) for hole in hole_masks])
+        # Where the target counts.
         supervised = holes.clone()
-        for place in fully_supervised:
-            supervised[place] = True
+        for index in fully_supervised:
+            supervised[index] = True
         return ViewBatch(
-            rgb=torch.stack([completed.rgb for completed, _, _, _ in views]),
-            alpha=torch.stack([completed.alpha for completed, _, _, _ in views]),
-            base_rgb=torch.stack([base_rgb.to(device) for _, base_rgb, _, _ in views]),
-            target=torch.stack([target.to(device) for _, _, target, _ in views]),
+            rgb=torch.stack([rendering.rgb for rendering in renderings]),
+            alpha=torch.stack([rendering.alpha for rendering in renderings]),
+            base_rgb=torch.stack([base_rgb.to(device) for base_rgb in base_images]),
+            target=torch.stack([target.to(device) for target in targets]),
             hole=holes,
             supervised=supervised,
         )
@@ -327,6 +328,7 @@ class ResidualTask(ViewTask):
         self.training: WholeViews | StoredCrops
         self.validation: WholeViews | StoredCrops
         if recipe.data.crops is None:
+            # Views of different photos differ in size, so each passes through the network alone.
             self.micro_batch = 1
             whole_views = find_whole_views(recipe.data, self.network, self.renderer)
             self.training = whole_views.training

@@ -97,9 +97,10 @@ def cut_metrics(path: Path, last_step: int) -> None:
 
 @contextlib.contextmanager
 def _open_curves(folder: Path, last_step: int, log: Callable[[str], None]) -> Iterator[Any]:
-    """TensorBoard's writer, open during the block; None without TensorBoard, which `log` is told.
+    """TensorBoard's writer, open during the block.
 
-    Values that the folder has of steps after `last_step` are hidden.
+    Without TensorBoard it is None, and `log` gets a line that says so. Values that the folder has
+    of steps after `last_step` are hidden.
     """
     try:
         # If this package is missing, torch's import raises another error than ImportError.

@@ -150,8 +150,8 @@ def _make_crops(
 
     `planned` names the source that the view comes from, and the view's number in this source.
     """
-    # The source is known, but drawing it again leaves the random generator in the state from which
-    # the view is to be made.
+    # The source is known already. It is drawn again because this leaves the random generator in the
+    # state from which the view is to be made.
     _, rng = _draw_source(sources, seed, index)
     source = sources[planned.source_index]
     number = planned.number

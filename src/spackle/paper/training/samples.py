@@ -204,11 +204,11 @@ class Sample:
 
     @functools.cached_property
     def tiles(self) -> Tensor:
-        """[ceil(H/16), ceil(W/16)] bool, on the CPU: tiles of the renderer that aux Gaussians can
-        touch.
+        """[ceil(H/16), ceil(W/16)] bool, on the CPU: the renderer's tiles that may change.
 
-        These are the tiles near the hole. A view with few hole pixels has aux Gaussians elsewhere,
-        too: its least opaque cells, so that there are at least 64.
+        A tile of 16×16 pixels may change if it is near the hole, which aux Gaussians fill. In a
+        view whose hole has fewer than 64 cells, the least opaque cells outside get aux Gaussians,
+        too, and the tiles near these may change.
         """
         height, width = self.rendering.alpha.shape
         cells = self.view.chosen_cells("masked")

@@ -323,8 +323,8 @@ def validate_and_report(run: TrainingRun) -> dict[str, float]:
 def save_if_due(run: TrainingRun) -> None:
     """After a step: let process 0 write the weights and a checkpoint, if it is time.
 
-    It is time every `run.save_every` steps of the recipe, and when the run ends, be it that the
-    last validation was no improvement.
+    It is time every `run.save_every` steps of the recipe, and when the run ends. It may end before
+    its last step, because validations have stopped to improve.
     """
     is_due = run.progress.step % run.recipe.run.save_every == 0 or run.end_reason() is not None
     if rank() != 0 or not is_due:

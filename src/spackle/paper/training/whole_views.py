@@ -50,19 +50,20 @@ class WholeViews:
         Args:
             files: the dataset.
             photos: the photos' indices in the dataset.
-            network: says which class computes its inputs.
-            renderer: renders the base from the views.
+            network: names its inputs, and thereby the class that computes them.
+            renderer: renders the base, the photo's Gaussians, from the views.
         """
         self.network = network
         self.renderer = renderer
-        # The photo's index in the dataset, and the view's number.
+        # Of each view: the photo's index in the dataset, and the view's number among the photo's.
         self.views: list[tuple[int, int]] = []
         for photo in photos:
             _, entry = files.samples[photo]
             self.views += [(photo, view) for view in range(len(entry.holes))]
         self._read_photo = lru_cache(maxsize=KEPT_PHOTOS)(files.__getitem__)
 
-        # Threads that read samples begin with CUDA's device 0, whatever this process uses.
+        # Samples are read by threads. A new thread uses CUDA's device 0, so each is told which
+        # device this process uses; see `_on_renderer_device`.
         self._cuda_device: int | None = None
         if renderer.device.type == "cuda":
             self._cuda_device = torch.cuda.current_device()
@@ -101,10 +102,11 @@ class WholeViews:
 def find_whole_views(data: DataRecipe, network: ResidualNet, renderer: Renderer) -> SplitViews:
     """The whole views of a recipe's dataset, for training and for validation.
 
-    All views count, also those with few holes or none, as the photo's own, and small photos.
+    All views count: also those with few holes or none, such as the photo's own view, and those of
+    photos that are too small for crops.
 
     Args:
-        data: names the dataset, and the numbers of views.
+        data: the recipe's data: the dataset, and the numbers of views.
         network: the network that is trained.
         renderer: renders the base from the views.
 

@@ -61,19 +61,21 @@ def read_label(dataset: EvalDataset, scenes: Sequence[Path], root: Path) -> Labe
         InputError: an about.json is damaged, the title is that of one of the paper's datasets, or
             scenes have different labels.
     """
+    # All labels that occur, each with a scene that has it, for the message.
     labels = {_label_of_scene(dataset, scene, root): scene for scene in scenes}
-    if len(labels) > 1:
-        first, second, *_ = labels.items()
+    label, *other_labels = labels
+    if other_labels:
+        other = other_labels[0]
         raise InputError(
-            f"{second[1]}: scene of {second[0].title!r}, but {first[1]} of {first[0].title!r}: "
+            f"{labels[other]}: scene of {other.title!r}, but {labels[label]} of {label.title!r}: "
             "evaluate each by itself"
         )
-    (label,) = labels
     return label
 
 
 def _label_of_scene(dataset: EvalDataset, scene: Path, root: Path) -> Label:
     """The label of one scene's folder; see `read_label`."""
+    # A scene's own file goes before the one of all scenes.
     for folder in (scene, root):
         path = folder / ABOUT_FILE
         if path.is_file():
@@ -84,6 +86,7 @@ def _label_of_scene(dataset: EvalDataset, scene: Path, root: Path) -> Label:
             return Label(title=about.title, terms=about.terms, about=about.about)
     if dataset.title:
         return Label(title=dataset.title, terms=dataset.terms)
+    # Photos of one's own, which are no published dataset, are named after their folder.
     title = root.resolve().name
     _check_title(title, root)
     return Label(title=title, terms=dataset.terms)

@@ -125,7 +125,7 @@ def _read_json(path: Path) -> dict[str, Any]:
         # Some editors of Windows begin a file with a byte order mark, which JSON does not allow.
         content = json.loads(text.removeprefix("\N{ZERO WIDTH NO-BREAK SPACE}"))
     if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no JSON object: begin with a brace")
+        raise InputError(f"{path}: holds no JSON object: put its content in braces, {{…}}")
     return content
 
 
@@ -207,11 +207,12 @@ def _posed_cases(folder: Path, scene: _PosedPhotos) -> list[Case]:
         if depth_file is not None:
             read_depth = partial(_read_depth, folder / depth_file, case.camera)
             case = dataclasses.replace(case, read_depth=read_depth)
-        # Without any depth, nobody knows which distances are near: those of the nearest photos are.
+        # `make_cases` compares a camera's distance with the scene's depth. Where no depth is known,
+        # the nearest cameras count as near instead.
         if math.isnan(posed_photos[index].middle_depth):
             second_views = tuple(
-                dataclasses.replace(view, is_among_nearest=place < MAX_NEAR_VIEWS)
-                for place, view in enumerate(case.second_views)
+                dataclasses.replace(view, is_among_nearest=rank < MAX_NEAR_VIEWS)
+                for rank, view in enumerate(case.second_views)  # the nearest first
             )
             case = dataclasses.replace(case, second_views=second_views)
         cases.append(case)
