@@ -228,14 +228,18 @@ def _xyz_of(xy: tuple[float, float]) -> Floats:
 
 def _rgb_to_xyz(primaries: Chromaticities) -> Floats:
     """[3, 3]: linear RGB to X, Y, Z; white has luminance 1. ValueError if they span no colours."""
-    # One column each; a primary without luminance (that of X or Z) is a column, too.
+    # A column of X, Y, Z for each primary. They are not divided by y, which may be 0 for a primary
+    # that is imaginary light.
     columns = [
         np.array([x, y, 1 - x - y]) for x, y in (primaries.red, primaries.green, primaries.blue)
     ]
     unscaled = np.stack(columns, axis=1)
-    # A triangle of this area is a line: broken numbers, whose inverse would be huge.
+    # The determinant is twice the area of the triangle of the three primaries. So small a triangle
+    # is a line: its numbers are broken, and the inverse of the matrix would be huge.
     if not abs(np.linalg.det(unscaled)) > 1e-4:
         raise ValueError("the primaries lie in a line")
+
+    # How much of each primary makes white.
     scales = np.linalg.solve(unscaled, _xyz_of(primaries.white))
     if not (scales > 0).all():
         raise ValueError("white lies outside of the primaries")
@@ -294,11 +298,12 @@ def to_srgb(codes: Codes, max_code: int, space: ColorSpace, peak: float | None =
     if space.is_srgb:
         return torch.from_numpy(codes.astype(np.float32)).div_(max_code)
 
+    # Tables and matrices, so that a pixel needs no power or logarithm.
     light_of_code = _light_of_codes(max_code, space)  # [3, max_code + 1]
     luminance = space.luminance.astype(np.float32)
     matrix = space.to_srgb_primaries.astype(np.float32)
     if not space.transfer.is_hdr:
-        peak = 1.0
+        peak = 1.0  # nothing is brighter than white
     elif peak is None:
         peak = _peak_of(codes, light_of_code, space)
     gains = tone_gains(peak).astype(np.float32)
@@ -307,8 +312,15 @@ def to_srgb(codes: Codes, max_code: int, space: ColorSpace, peak: float | None =
     def convert_rows(start: int, stop: int) -> None:
         """Convert the rows start..stop−1."""
         _convert(
-            *(codes[start:stop], light_of_code, space.transfer.is_hlg, luminance),
-            *(np.float32(peak), gains, matrix, _SRGB_OF_ROOT, result[start:stop]),
+            codes[start:stop],
+            light_of_code,
+            space.transfer.is_hlg,
+            luminance,
+            np.float32(peak),
+            gains,
+            matrix,
+            _SRGB_OF_ROOT,
+            result[start:stop],
         )
 
     parallel_for_chunks(convert_rows, len(codes))
@@ -375,6 +387,8 @@ def tone_gains(peak: float) -> Floats:
     """
     if peak <= 1:
         return np.ones_like(_ROOTS)
+    # BT.2390 works with numbers of PQ, whose steps are equally visible: light becomes a number, the
+    # number is mapped, and becomes light again.
     light = _ROOTS**2 * peak
     peak_code = float(nits_to_pq(np.array(peak * REFERENCE_WHITE_NITS)))
     codes = nits_to_pq(light * REFERENCE_WHITE_NITS)
@@ -445,6 +459,8 @@ def _convert(
             green = light_of_code[1, codes[row, column, 1]]
             blue = light_of_code[2, codes[row, column, 2]]
             if is_hlg:
+                # HLG has the light of the scene. That of a display is a power of its luminance (the
+                # system gamma), with the same ratios between red, green and blue.
                 scene = luminance[0] * red + luminance[1] * green + luminance[2] * blue
                 display = scene ** np.float32(HLG_SYSTEM_GAMMA - 1) * np.float32(_HLG_PEAK)
                 red *= display

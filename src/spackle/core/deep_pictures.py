@@ -8,6 +8,7 @@ visible.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Any, BinaryIO
 
 import av
@@ -24,6 +25,7 @@ from spackle.core.tiff_directories import ORIENTATION, SIDEWAYS_ORIENTATIONS
 
 Codes = NDArray[np.uint16]
 MAX_CODE = 65535
+MAX_PIXELS_FOR_COLORS = 100_000_000  # of a photo that is decoded only for what it states
 
 # FFmpeg's decoder and the box with its settings, for each type of item.
 _DECODERS = {b"hvc1": ("hevc", b"hvcC"), b"av01": ("libdav1d", b"av1C")}
@@ -122,23 +124,40 @@ def _decode_avif(file: BinaryIO, max_pixels: int) -> Codes | None:
     if items is None:
         return None
     primary = items.primary
-    tiles = items.referred(b"dimg", primary) if items.types.get(primary) == GRID else [primary]
+    is_grid = items.types.get(primary) == GRID
+    tiles = items.referred(b"dimg", primary) if is_grid else [primary]
     settings = items.property(tiles[0], b"av1C") if tiles else None
     # The third byte of the settings begins with profile flags; this bit says "more than 8 bits".
     is_deep = settings is not None and len(settings) > 2 and settings[2] & 0x40
-    alpha_item = items.alpha_of(primary)
     if not is_deep:
         return None
-    if items.types.get(primary) != GRID:
-        colors = _rgb_of_frame(_decode_item(items, primary, max_pixels), items, primary)
-        if alpha_item is None:
-            return colors
-        opacity = _opacity_of_frame(_decode_item(items, alpha_item, max_pixels))
-        return np.concatenate([colors, opacity[..., None]], axis=-1)
-    if alpha_item is not None:
-        return None
 
-    # The item of a grid says how many tiles there are, and how much of them is shown.
+    alpha_item = items.alpha_of(primary)
+    if is_grid:
+        # A grid with opacity is rare, and is left to Pillow, which gives 8 bits of it.
+        return None if alpha_item is not None else _decode_grid(items, tiles, max_pixels)
+    colors = _rgb_of_frame(_decode_item(items, primary, max_pixels), items, primary)
+    if alpha_item is None:
+        return colors
+    opacity = _opacity_of_frame(_decode_item(items, alpha_item, max_pixels))
+    return np.concatenate([colors, opacity[..., None]], axis=-1)
+
+
+def _decode_grid(items: HeifItems, tiles: Sequence[int], max_pixels: int) -> Codes:
+    """The primary picture [H, W, 3] of an AVIF in 0..65535, if it is a grid of tiles.
+
+    Args:
+        items: of the file.
+        tiles: the items that are the tiles, row by row.
+        max_pixels: how large the picture may be.
+
+    Raises:
+        ValueError: the grid has another number of tiles, or is too large.
+    """
+    # The item of a grid says how many tiles there are, and how much of them is shown: its version
+    # (1 byte), flags (1 byte), rows − 1, columns − 1, and width and height. The first flag says
+    # that these have 4 bytes each instead of 2.
+    primary = items.primary
     grid = items.content(primary)
     rows = grid[2] + 1
     columns = grid[3] + 1
@@ -157,16 +176,17 @@ def _decode_avif(file: BinaryIO, max_pixels: int) -> Codes | None:
 
 
 def bitstream_cicp(items: HeifItems) -> tuple[int, int] | None:
-    """CICP's numbers of primaries and transfer function in the compressed photo; None without.
+    """CICP's numbers of primaries and transfer function, as the compressed photo states them.
 
-    Of a grid, the first tile's. Unspecified is 2.
+    Those of a grid are those of its first tile. 2 means unspecified. None if the photo cannot be
+    decoded.
     """
     item = next(iter(items.referred(b"dimg", items.primary)), items.primary)
     if items.types.get(item) not in _DECODERS:
         return None
     try:
         # A tile is small; a photo that is no grid is decoded twice, which costs a second.
-        frame = _decode_item(items, item, max_pixels=100_000_000)
+        frame = _decode_item(items, item, max_pixels=MAX_PIXELS_FOR_COLORS)
     except Exception:  # a damaged picture: the decoder of the photo says what is wrong
         return None
     return int(frame.color_primaries), int(frame.color_trc)
@@ -190,6 +210,7 @@ def _decode(
     context.options = {"max_pixels": str(max_pixels)}
     if extradata is not None:
         context.extradata = extradata
+    # Some decoders hold a frame back until they are told (by None) that no bytes follow.
     frames = context.decode(av.Packet(content)) or context.decode(None)
     if not frames:
         raise ValueError("the picture cannot be decoded")
@@ -203,6 +224,8 @@ def _rgb_of_frame(frame: av.VideoFrame, items: HeifItems, item: int) -> Codes:
     """
     matrix = int(frame.colorspace)
     is_full_range = int(frame.color_range) == FULL_RANGE
+    # What the file states is in the box `colr`: the name nclx (4 bytes), primaries, transfer
+    # function and matrix (2 bytes each), and a byte whose first bit says "full range".
     for kind, body in items.properties.get(item, []):
         if kind == b"colr" and bytes(body[:4]) == b"nclx" and len(body) >= 11:
             (matrix,) = struct.unpack_from(">H", body, 8)
@@ -243,13 +266,15 @@ def ycbcr_to_rgb(
     Raises:
         ValueError: a matrix that is not read.
     """
-    step = 1 << (bits - 8)
+    # Which code is black, and how many codes lie between the least and the greatest value.
+    step = 1 << (bits - 8)  # one step of 8 bits
     black = 16 * step
     luma_steps = 219 * step
     chroma_steps = 224 * step
     if is_full_range:
         black = 0
-        luma_steps = chroma_steps = (1 << bits) - 1
+        luma_steps = (1 << bits) - 1
+        chroma_steps = luma_steps
 
     def luma(plane: NDArray[np.uint16]) -> NDArray[np.float32]:
         """A plane in 0..1."""
@@ -265,6 +290,7 @@ def ycbcr_to_rgb(
     if matrix not in _LUMINANCE_OF_MATRIX:
         raise ValueError(f"the colour matrix {matrix} is not read")
 
+    # Luminance y is a weighted sum of red, green and blue, whose weights the matrix gives.
     red_share, blue_share = _LUMINANCE_OF_MATRIX[matrix]
     green_share = 1 - red_share - blue_share
     height, width = planes[0].shape
@@ -277,6 +303,8 @@ def ycbcr_to_rgb(
     ]
     blue_difference = differences[0]
     red_difference = differences[1]
+    # The file has (red − y) / (2 · (1 − red_share)), and the same of blue. Green is what then is
+    # missing in the sum y.
     red: NDArray[np.float32] = y + np.float32(2 * (1 - red_share)) * red_difference
     blue: NDArray[np.float32] = y + np.float32(2 * (1 - blue_share)) * blue_difference
     green: NDArray[np.float32] = y - np.float32(red_share) * red - np.float32(blue_share) * blue
@@ -295,7 +323,8 @@ def _enlarged(plane: NDArray[np.float32], height: int, width: int) -> NDArray[np
     if plane.shape == (height, width):
         return plane
     stored = torch.from_numpy(np.ascontiguousarray(plane))[None, None]
-    # An odd width has half a column of differences more; so the size in the plane's own steps.
+    # A difference stands for one or two rows and columns. Those of an odd picture reach beyond it,
+    # so the plane is enlarged by whole factors, and then cut to the size.
     steps_y = round(height / plane.shape[0])
     steps_x = round(width / plane.shape[1])
     larger = torch.nn.functional.interpolate(
@@ -324,6 +353,7 @@ def _decode_png(file: BinaryIO, max_pixels: int) -> Codes:
     if name.startswith("ya16"):  # grey and transparency
         grey_and_alpha = _interleaved(frame, 2, name)
         return grey_and_alpha[..., [0, 0, 0, 1]]
+    # The name ends in the byte order, "be" or "le".
     channels = {"rgb48": 3, "rgba64": 4}.get(name[:-2])
     if channels is None:
         raise ValueError(f"the layout {name} is not read")

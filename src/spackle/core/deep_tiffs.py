@@ -102,7 +102,8 @@ class _Layout:
             block_width = width
             block_height = min(directory.number(_ROWS_PER_STRIP, height), height)
         sides = (width, height, block_width, block_height)
-        # A block that is much larger than the picture is damage that would cost memory.
+        # A block that is much larger than the picture is damage that would cost memory. A tile of a
+        # small picture may have up to a million pixels (1 << 20).
         is_sensible = min(sides) > 0 and 3 <= samples <= MAX_SAMPLES
         if not is_sensible or block_width * block_height > 4 * width * height + (1 << 20):
             raise ValueError("an impossible layout of a TIFF")
@@ -197,19 +198,23 @@ def _unpack(packed: bytes, compression: int, row_bytes: int, row_count: int) -> 
 
 def _grey_tiff(packed: bytes, compression: int, width: int, height: int) -> BinaryIO:
     """A TIFF of one grey picture of 8 bits, whose compressed bytes are these."""
+    # The numbers of tags are those of TIFF 6.0.
     tags: dict[int, int] = {
         256: width,
         257: height,
-        258: 8,
+        258: 8,  # bits of a sample
         259: compression,
-        262: 1,
-        277: 1,
-        278: height,
-        279: len(packed),
+        262: 1,  # 0 is black
+        277: 1,  # samples of a pixel
+        278: height,  # rows of a strip: there is one strip
+        279: len(packed),  # bytes of the strip
     }
+    # The strip lies behind the header (8 bytes) and the directory: the count of its entries (2
+    # bytes), the entries (12 bytes each), and where another directory lies (4 bytes, 0 for none).
     entry_count = len(tags) + 1
     head_size = 8 + 2 + 12 * entry_count + 4
-    tags[273] = head_size
+    tags[273] = head_size  # where the strip begins
+    # An entry has the tag, the type (4 is a number of 4 bytes), how many numbers, and the number.
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, tags[tag]) for tag in sorted(tags))
     head = b"II" + struct.pack("<HIH", TIFF_NUMBER, 8, entry_count)
     return io.BytesIO(head + entries + bytes(4) + packed)

@@ -55,7 +55,8 @@ class HeifItems:
     def of(data: bytes) -> HeifItems | None:
         """The items of a file; None if it lists none or its list is broken."""
         try:
-            top = dict(reversed(list(_top_boxes(memoryview(data)))))  # the first of each type
+            # A dict keeps the last box of each type; reversed, that is the first in the file.
+            top = dict(reversed(list(_top_boxes(memoryview(data)))))
             # The first 4 bytes of most boxes are version and flags.
             meta = dict(_boxes(top[b"meta"][4:]))
             primary = _primary_item(meta[b"pitm"])
@@ -119,9 +120,11 @@ class HeifItems:
 
     def shown_pictures(self) -> list[int]:
         """The items that are pictures of their own: no tile, thumbnail, mask or gain map."""
+        # Tiles, of which other items are derived ("dimg").
         parts = {
             target for kind, _, targets in self.references if kind == b"dimg" for target in targets
         }
+        # Thumbnails ("thmb") of other items, and their masks, depth or gain maps ("auxl").
         helpers = {source for kind, source, _ in self.references if kind in (b"thmb", b"auxl")}
         return [
             item
@@ -233,7 +236,9 @@ def _item_references(iref: memoryview | None) -> list[tuple[bytes, int, list[int
 def _item_pieces(
     data: memoryview, iloc: memoryview | None, idat: memoryview | None
 ) -> dict[int, list[Piece]]:
-    """The pieces of each item, from the content of the box `iloc`.
+    """Where each item's content lies, from the content of the box `iloc`: one or several pieces.
+
+    A piece is (the bytes in which it lies, its begin, its end).
 
     Args:
         data: the file, in which most items lie.
@@ -263,11 +268,12 @@ def _item_pieces(
             base = fields.take(base_size)
             pieces: list[Piece] = []
             for _ in range(fields.take(2)):
-                fields.take(index_size)
+                fields.take(index_size)  # a number for items that lie in other items
                 begin = base + fields.take(offset_size)
                 length = fields.take(length_size)
                 if source is not None:
-                    pieces.append((source, begin, begin + length if length else len(source)))
+                    end = begin + length if length else len(source)  # 0: up to the end
+                    pieces.append((source, begin, end))
             if method in (0, 1):
                 pieces_of_items[item] = pieces
     except BOX_ERRORS:

@@ -36,7 +36,9 @@ def color_space_of_icc(profile: bytes) -> ColorSpace | None:
     """
     try:
         tags = _tags(profile)
-        kind = profile[16:20]
+        kind = profile[16:20]  # what the numbers of a picture are
+        # Tables ("A2B0", …), or a connection space (bytes 20 to 23) other than X, Y, Z, are more
+        # than primaries and curves.
         has_tables = any(name in tags for name in (b"A2B0", b"A2B1", b"A2B2"))
         if has_tables or profile[20:24] != b"XYZ ":
             return None
@@ -134,6 +136,7 @@ def _description(profile: bytes) -> str:
 
 def _tags(profile: bytes) -> dict[bytes, bytes]:
     """The tags of a profile with their content; struct.error if it is cut off."""
+    # Behind the header of 128 bytes: the count of tags, then the name, place and size of each.
     (count,) = struct.unpack_from(">I", profile, 128)
     tags: dict[bytes, bytes] = {}
     for index in range(min(count, MAX_TAGS)):
@@ -176,12 +179,16 @@ def _parametric(tag: bytes) -> Curve:
     (kind,) = struct.unpack_from(">H", tag, 8)
     values = np.array(struct.unpack_from(f">{_PARAMETER_COUNTS[kind]}i", tag, 12)) / 65536
     # The names are those of ICC's specification: (a·x + b)^g + e where x ≥ d, else c·x + f.
-    g, a, b, c, d, e, f = (values[0], 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    # Kind 0 has g alone; higher kinds have more of the numbers, and the rest follows.
+    g = values[0]
+    a = 1.0
+    b = c = d = e = f = 0.0
     if kind >= 1:
         a, b = values[1:3]
         d = -b / a if a else 0.0
     if kind == 2:
-        e = f = values[3]
+        e = values[3]
+        f = e
     if kind >= 3:
         c, d = values[3:5]
     if kind == 4:

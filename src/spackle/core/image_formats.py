@@ -124,6 +124,7 @@ def kind_of_bytes(head: bytes) -> FileKind:
     for magic, kind in _MAGIC:
         if head.startswith(magic):
             return kind
+    # RIFF is a container; behind its size (4 bytes) stands what it contains.
     if head.startswith(b"RIFF"):
         return {b"WEBP": WEBP, b"AVI ": VIDEO}.get(head[8:12], FileKind("RIFF"))
     if head[4:8] == b"ftyp":
@@ -131,6 +132,7 @@ def kind_of_bytes(head: bytes) -> FileKind:
     # "P6" alone would also fit a text; a space or a comment follows in every file of this kind.
     if head.startswith(_PNM_MAGIC) and head[2:3] in (b" ", b"\n", b"\r", b"\t", b"#"):
         return PNM
+    # Texts such as HTML, without the byte order mark and blanks that may stand before them.
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t").lower()
     for beginning, kind in _MARKUP:
         if text.startswith(beginning):
@@ -194,7 +196,10 @@ def list_photos(
     for file in list_files(folder, ("",), below=below):
         # A usual suffix saves opening the file, which takes long for many files on a server.
         is_photo = file.name.lower().endswith(PHOTO_SUFFIXES) or _looks_like_photo(file)
-        (photos if is_photo else left_out).append(file)
+        if is_photo:
+            photos.append(file)
+        else:
+            left_out.append(file)
     if left_out and log is not None:
         log(f"{folder}: {describe_left_out(left_out, folder)}")
     return photos

@@ -93,6 +93,7 @@ def refuse_other_projections(
 
 def _projection_of_xmp(xmp: bytes) -> str | None:
     """Which projection XMP states, with its extent; None for a flat picture or no statement."""
+    # Most photos do not name the namespace of panoramas, and need not be parsed.
     if _GPANO.strip("{}").encode() not in xmp:
         return None
     try:
@@ -143,18 +144,27 @@ def looks_like_360(rgb: Tensor) -> bool:
     if width != 2 * height or width < MIN_WIDTH_360:
         return False
     pixels = rgb.numpy()
-    first, second, last = pixels[:, 0], pixels[:, 1], pixels[:, -1]
-    neighbour_difference = float(np.abs(first - second).mean())
-    seam_difference = float(np.abs(first - last).mean())
+
+    # The left and the right border of a 360° photo meet, so they differ as little as neighbouring
+    # columns. The step of 8 bits (1 / 255) is for a photo whose neighbouring columns are equal.
+    first_column = pixels[:, 0]
+    neighbour_difference = float(np.abs(first_column - pixels[:, 1]).mean())
+    seam_difference = float(np.abs(first_column - pixels[:, -1]).mean())
+    is_closed = seam_difference <= MAX_SEAM_RATIO * neighbour_difference + 1 / 255
+
+    # The first and the last row show a single point each, straight up and straight down. They have
+    # much less contrast than rows in the middle third, of which every 16th is enough.
     middle_contrast = float(pixels[height // 3 : -height // 3 : 16].std(axis=1).mean())
     pole_contrast = float(pixels[[0, -1]].std(axis=1).max())
-    is_closed = seam_difference <= MAX_SEAM_RATIO * neighbour_difference + 1 / 255
     has_poles = pole_contrast <= MAX_POLE_RATIO * middle_contrast
-    return is_closed and has_poles and float(first.std()) > MIN_CONTRAST
+
+    # In a column without contrast, such as a white margin, the first test says nothing.
+    return is_closed and has_poles and float(first_column.std()) > MIN_CONTRAST
 
 
 def xmp_of_image(image: Image.Image, exif: Mapping[int, object]) -> bytes:
     """The packet of XMP that Pillow found in a picture; empty without."""
+    # Where Pillow keeps it depends on the format: that of JPEG and WebP, of PNG, and of TIFF.
     for packet in (
         image.info.get("xmp"),
         image.info.get("XML:com.adobe.xmp"),

@@ -101,7 +101,7 @@ def read_raw_file(file: BinaryIO, kind: FileKind) -> RawFile | None:
     exif = read_exif(file)
     file.seek(0)
     content = file.read()
-    if not exif:
+    if not exif:  # not a TIFF
         exif = _canon_exif(content)
 
     previews: dict[tuple[int, int], Preview] = {}
@@ -110,7 +110,9 @@ def read_raw_file(file: BinaryIO, kind: FileKind) -> RawFile | None:
         previews.setdefault((preview.width, preview.height), preview)
         if len(previews) >= MAX_PREVIEWS:
             break
+    # The largest first.
     by_area = sorted(previews.values(), key=lambda preview: -preview.width * preview.height)
+    # DNG says with a preview which colours it has; the first such statement counts.
     for directory in directories:
         if PREVIEW_COLOR_SPACE in directory.tags:
             exif.setdefault(PREVIEW_COLOR_SPACE, directory.number(PREVIEW_COLOR_SPACE))
@@ -136,6 +138,7 @@ def _tiff_previews(content: bytes, directories: list[TiffDirectory]) -> Iterator
     for directory in directories:
         if directory.is_sensor_data:
             continue
+        # A JPEG has tags of its own, or is the only strip of the picture.
         jpeg_begin = directory.number(JPEG_OFFSET)
         jpeg_end = jpeg_begin + directory.number(JPEG_LENGTH)
         offsets = directory.numbers(STRIP_OFFSETS)
@@ -186,7 +189,8 @@ def jpeg_size(content: bytes, begin: int) -> tuple[int, int] | None:
         marker = head[1]
         length = int.from_bytes(head[2:], "big")
         if marker in _JPEG_FRAMES:
-            # Bits, height, width, and the number of channels.
+            # Bits (1 byte), height and width (2 bytes each), and the number of channels (1 byte).
+            # A JPEG of more bits holds the sensor's numbers, and is no finished picture.
             frame = content[position + 4 : position + 10]
             if len(frame) < 6 or frame[0] != 8 or frame[5] not in (1, 3):
                 return None
@@ -202,6 +206,7 @@ def _canon_exif(content: bytes) -> dict[int, object]:
     """The tags of a CR3, which consists of boxes; each box of tags is a small TIFF."""
     exif: dict[int, object] = {}
     for name in _BOX_OF_CANON_TAGS:
+        # A box begins with its size (4 bytes), which counts these and the name, and its name.
         place = content.find(name)
         if place < 4:
             continue

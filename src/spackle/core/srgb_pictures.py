@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from collections.abc import Mapping
 
@@ -44,11 +45,11 @@ class SrgbPicture:
 def picture_to_srgb(
     picture: OpenPicture, path: StrPath, max_side: int | None = None
 ) -> SrgbPicture:
-    """Decode a photo's file; `path` is its name in messages.
+    """A photo's pixels, decoded from its open file: in sRGB, and upright.
 
     Args:
         picture: the open file.
-        path: its name.
+        path: its name in messages.
         max_side: if given, the result is smaller than the file's picture: its long side has at most
             so many pixels. For previews, because converting takes more memory than decoding.
 
@@ -61,6 +62,7 @@ def picture_to_srgb(
     stated = read_stated_colors(image, picture.exif, picture.kind, picture.file)
     codes, depth_note = _deep_codes(picture, stated)
     if codes is None:
+        # Pillow decodes 8 bits.
         image.load()
         _check_decoded_size(picture, path)
         if max_side is not None:
@@ -68,7 +70,8 @@ def picture_to_srgb(
         result = image_to_srgb(image, stated, picture.exif, path)
     else:
         if max_side is not None:
-            step = max(1, -(-max(codes.shape[:2]) // max_side))  # rounded up
+            # Every n-th row and column, as few as it takes.
+            step = max(1, math.ceil(max(codes.shape[:2]) / max_side))
             codes = np.ascontiguousarray(codes[::step, ::step])
         rgb = _codes_to_srgb(codes, stated)
         # HEIF is upright already.
@@ -134,6 +137,7 @@ def image_to_srgb(
         space = _space_for_codes(stated)
         return SrgbPicture(to_srgb(np.repeat(codes[..., None], 3, axis=2), max_code, space), notes)
 
+    # Colours that the file states by numbers. An ICC profile is applied below, by LittleCMS.
     if stated.icc is None and not stated.space.is_srgb:
         codes, alpha = _codes_and_alpha(image)
         return SrgbPicture(_over_white(to_srgb(codes, 255, stated.space), alpha), notes)

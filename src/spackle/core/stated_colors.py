@@ -97,6 +97,7 @@ def read_stated_colors(
         file: the open file; None for a picture in memory, of which only what Pillow keeps is known.
     """
     stated = _statement_that_counts(image, exif, kind, file)
+    # A profile for HDR says what the numbers are, but cannot convert them as other profiles can.
     hdr_space = None if stated.icc is None else hdr_space_of_icc(stated.icc)
     return stated if hdr_space is None else StatedColors(hdr_space)
 
@@ -107,7 +108,11 @@ def _statement_that_counts(
     kind: FileKind | None,
     file: BinaryIO | None,
 ) -> StatedColors:
-    """The statement of a file that counts; the arguments are those of `read_stated_colors`."""
+    """Which of several statements in a file counts; arguments as for `read_stated_colors`.
+
+    What a format states itself goes before an ICC profile where its specification says so (PNG),
+    and EXIF counts last.
+    """
     icc = image.info.get("icc_profile") or None
     if file is None:
         return _colors_in_memory(image, exif, icc)
@@ -125,8 +130,8 @@ def _statement_that_counts(
 def read_colors_of_open_image(image: Image.Image) -> StatedColors | None:
     """What the file of a picture that Pillow has opened states by CICP, which Pillow does not keep.
 
-    None if it is no PNG or AVIF, its file is not at hand, or states nothing. To be called before
-    its EXIF is read, for which Pillow loads a PNG, and forgets its file.
+    None if it is no PNG or AVIF, its file is not at hand, or states nothing. Call this before you
+    read the picture's EXIF: for that, Pillow loads a PNG, and then forgets its file.
     """
     if image.format not in (PNG.pillow, AVIF.pillow):
         return None
@@ -170,7 +175,7 @@ def _colors_in_memory(
     if icc is not None:
         return StatedColors(icc=icc)
     info = image.info
-    nclx = info.get("nclx_profile")
+    nclx = info.get("nclx_profile")  # CICP's numbers of a HEIF; 2 is unspecified
     if isinstance(nclx, Mapping):
         primaries = int(nclx.get("color_primaries", 2))
         transfer = int(nclx.get("transfer_characteristics", 2))
@@ -207,7 +212,10 @@ def _png_chunks(file: BinaryIO) -> dict[bytes, bytes]:
 
 
 def _png_colors(chunks: Mapping[bytes, bytes], icc: bytes | None) -> StatedColors | None:
-    """The statement that counts in a PNG; None if it has none."""
+    """The statement that counts in a PNG; None if it has none.
+
+    The PNG specification says which chunk goes before which: cICP, iCCP, sRGB, then gAMA and cHRM.
+    """
     cicp = chunks.get(b"cICP", b"")
     if len(cicp) == 4:
         primaries, transfer, _, full_range = cicp
@@ -296,8 +304,9 @@ def _heif_colors(file: BinaryIO) -> StatedColors | None:
             if kind == b"colr" and bytes(body[:4]) in (b"nclx", b"nclc"):
                 return _nclx_colors(body)
 
-    # Without a statement in the file, the compressed picture may have one. Video encoders write
-    # those of SDR videos into any picture, so only what no encoder writes by itself is believed.
+    # Without a statement in the file, the compressed picture may have one. Video encoders write the
+    # numbers of ordinary videos into any picture. So a statement is believed only if it says HDR or
+    # wide primaries, which no encoder writes by itself.
     cicp = bitstream_cicp(items)
     if cicp is None:
         return None
@@ -349,10 +358,11 @@ def _bmp_colors(file: BinaryIO) -> StatedColors:
     gammas = np.array(struct.unpack_from("<3I", header, 96), np.float64) / 2**16
     if not endpoints.any() or not (gammas > 0).all():  # most writers leave them empty
         return StatedColors()
-    columns = np.vstack([endpoints, endpoints.sum(axis=0)])  # the last row is white
-    sums = columns.sum(axis=1, keepdims=True)
-    with np.errstate(all="ignore"):
-        red, green, blue, white = (tuple(pair) for pair in (columns / sums)[:, :2].tolist())
+    # Chromaticities are x = X / (X + Y + Z) and y = Y / (X + Y + Z). White is the sum of the three.
+    colors = np.vstack([endpoints, endpoints.sum(axis=0)])  # [4, 3]
+    with np.errstate(all="ignore"):  # `_colors_of` refuses what is not finite
+        chromaticities = (colors / colors.sum(axis=1, keepdims=True))[:, :2].tolist()
+    red, green, blue, white = (tuple(pair) for pair in chromaticities)
     transfer = Transfer("gamma", lambda code: code ** gammas[:, None])
     return _colors_of(Chromaticities(red, green, blue, white), transfer, "endpoints of the BMP")
 
@@ -401,11 +411,14 @@ def _exif_colors(exif: Mapping[int, object], *, is_tiff: bool = False) -> Stated
 def _exif_primaries(exif: Mapping[int, object]) -> Chromaticities | None:
     """The primaries that EXIF states, with D65 if it states no white; None without primaries."""
     numbers = _numbers(exif.get(_TAG_PRIMARIES))
-    if len(numbers) != 6:
+    if len(numbers) != 6:  # x and y of red, green and blue
         return None
     red, green, blue = _pairs(numbers)
-    white = _numbers(exif.get(_TAG_WHITE_POINT))
-    return Chromaticities(red, green, blue, (white[0], white[1]) if len(white) == 2 else D65)
+    white_numbers = _numbers(exif.get(_TAG_WHITE_POINT))
+    white = D65
+    if len(white_numbers) == 2:
+        white = (white_numbers[0], white_numbers[1])
+    return Chromaticities(red, green, blue, white)
 
 
 def _exif_transfer(exif: Mapping[int, object]) -> Transfer | None:
@@ -414,7 +427,7 @@ def _exif_transfer(exif: Mapping[int, object]) -> Transfer | None:
     # One column for all channels, or one for each, of 2^bits light values in 0..65535.
     for channels in (1, 3):
         entries, rest = divmod(len(table), channels)
-        if not rest and entries in (256, 65536):
+        if rest == 0 and entries in (256, 65536):
             light = np.reshape(table, (channels, entries)) / 65535
             return Transfer("table", functools.partial(_interpolate, light))
     gamma = _number(exif.get(_TAG_GAMMA))

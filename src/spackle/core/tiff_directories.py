@@ -111,7 +111,7 @@ def read_directories(file: BinaryIO) -> list[TiffDirectory]:
         return []
     directories: list[TiffDirectory] = []
     seen: set[int] = set()
-    waiting = [reader.first_directory()]
+    waiting = [reader.first_directory()]  # where directories begin that are still to be read
     while waiting and len(directories) < MAX_DIRECTORIES:
         offset = waiting.pop(0)
         if offset == 0 or offset in seen:  # the end, or a circle
@@ -196,6 +196,7 @@ class _Reader:
 
     def directory(self, offset: int) -> tuple[TiffDirectory, int] | None:
         """The directory at a place, and where the next one begins; None if it is broken."""
+        # BigTIFF counts entries and places with 8 bytes, where TIFF has 2 and 4.
         count_letter, entry_size = ("Q", 20) if self.is_big else ("H", 12)
         counts = self._numbers(offset, count_letter, 1)
         if not counts or not 0 < counts[0] <= MAX_ENTRIES:
@@ -211,6 +212,7 @@ class _Reader:
 
     def _entries(self, table: bytes, entry_size: int) -> Iterator[tuple[int, Value]]:
         """The tags of a directory's table with their values; unreadable ones are left out."""
+        # An entry: the tag's number, its type, how many elements it has, and its value.
         layout = struct.Struct(f"{self.order}{'HHQ8s' if self.is_big else 'HHI4s'}")
         place = struct.Struct(f"{self.order}{'Q' if self.is_big else 'I'}")
         for start in range(0, len(table), entry_size):
@@ -239,7 +241,13 @@ class _Reader:
         return size if 0 < size <= MAX_VALUE_BYTES else None
 
     def _value(self, kind: int, count: int, content: bytes) -> Value:
-        """The numbers or bytes of a tag."""
+        """The numbers or bytes of a tag; a fraction with the denominator 0 becomes NaN.
+
+        Args:
+            kind: TIFF's number of the type of the elements.
+            count: how many elements there are.
+            content: their bytes.
+        """
         if kind in _BYTE_TYPES:
             return content
         if kind in _NUMBER_LETTERS:
