@@ -34,6 +34,16 @@ class Hits:
     v: Floats  # [N] and of the third
     passed: Floats  # [N] share of light that panes in front let through, 1 without panes
 
+    def select(self, indices: NDArray[np.int64]) -> Hits:
+        """Those with these indices [M]."""
+        return Hits(
+            self.triangle[indices],
+            self.distance[indices],
+            self.u[indices],
+            self.v[indices],
+            self.passed[indices],
+        )
+
 
 class World:
     """The triangles of a world, ready to be hit and shaded."""
@@ -41,22 +51,30 @@ class World:
     def __init__(self, mesh: Mesh, made: dict[str, NDArray[np.uint8]]) -> None:
         """Build the search trees; `made` has the pictures that are not files, by name."""
         self.mesh = mesh
-        names = sorted({m.texture for m in mesh.materials if m.texture is not None})
-        self.pyramids: Pyramids = pyramids(find_pictures(names, made))
-        numbers = {name: number for number, name in enumerate(names)}
         materials = mesh.materials
+        names = sorted({one.texture for one in materials if one.texture is not None})
+        self.pyramids: Pyramids = pyramids(find_pictures(names, made))
+
+        # Arrays with an entry for each of the M materials, which compiled code can read.
+        numbers = {name: number for number, name in enumerate(names)}
         self.texture = np.array(
-            [MISS if m.texture is None else numbers[m.texture] for m in materials], np.int32
+            [MISS if one.texture is None else numbers[one.texture] for one in materials], np.int32
+        )  # [M] number of the picture, MISS without one
+        base = srgb_to_linear(np.array([_paint(one) for one in materials]))
+        tints = np.array([one.tint for one in materials], np.float32)
+        self.color = (base * tints).astype(np.float32)  # [M, 3] linear, multiplies the texture
+        self.specular = np.array([one.specular for one in materials], np.float32)
+        self.roughness = np.array([one.roughness for one in materials], np.float32)
+        self.emission = np.array([one.emission for one in materials], np.float32)
+        self.is_glass = np.array([one.opacity < GLASS_OPACITY for one in materials], bool)
+        holed = np.array(
+            [number >= 0 and bool(self.pyramids.has_holes[number]) for number in self.texture],
+            bool,
         )
-        base = srgb_to_linear(np.array([_paint(m) for m in materials]))
-        self.color = (base * np.array([m.tint for m in materials], np.float32)).astype(np.float32)
-        self.specular = np.array([m.specular for m in materials], np.float32)
-        self.roughness = np.array([m.roughness for m in materials], np.float32)
-        self.emission = np.array([m.emission for m in materials], np.float32)
-        self.is_glass = np.array([m.opacity < GLASS_OPACITY for m in materials], bool)
-        holed = np.array([t >= 0 and bool(self.pyramids.has_holes[t]) for t in self.texture], bool)
         self.is_sheer = self.is_glass | holed
 
+        # Rays may pass glass and the holes of leaves. These triangles have a tree of their own, so
+        # that all others, which are most, need no look at their texture.
         sheer = self.is_sheer[mesh.material]
         self.solid = _Tree(mesh.corners, np.flatnonzero(~sheer).astype(np.int32))
         self.sheer = _Tree(mesh.corners, np.flatnonzero(sheer).astype(np.int32))
@@ -67,9 +85,12 @@ class World:
         hits = self.solid.hits(origins, directions)
         if not self.sheer.count:
             return hits
+
+        # Sheer surfaces in front of the solid one are looked at one after the other, until one
+        # stops the ray.
         passed = hits.passed
-        start = np.zeros(len(origins), np.float32)
-        going = np.arange(len(origins))
+        start = np.zeros(len(origins), np.float32)  # [N] the distance from which a ray goes on
+        going = np.arange(len(origins))  # indices of the rays that go on
         for _ in range(MAX_LAYERS):
             begin = origins[going] + start[going, None] * directions[going]
             layer = self.sheer.hits(begin, directions[going])
@@ -81,6 +102,8 @@ class World:
             triangle = layer.triangle[nearer]
             u = layer.u[nearer]
             v = layer.v[nearer]
+
+            # A leaf stops the ray where its picture is more than half opaque; a pane never does.
             coverage = self._coverage(triangle, u, v)
             glass = self.is_glass[self.mesh.material[triangle]]
             stops = (coverage >= 0.5) & ~glass
@@ -89,7 +112,9 @@ class World:
             hits.distance[here] = distance[nearer][stops]
             hits.u[here] = u[stops]
             hits.v[here] = v[stops]
-            passed[going[glass & ~stops]] *= GLASS_PASS
+            passed[going[glass]] *= GLASS_PASS
+
+            # The other rays go on a little behind the surface.
             start[going] = distance[nearer] + NUDGE_M
             going = going[~stops]
             if not len(going):
@@ -101,6 +126,8 @@ class World:
         result = self.solid.blocked(origins, directions, distances)
         if not self.sheer.count:
             return result
+
+        # As in `first_hits`: rays go on through sheer surfaces, until one stops them.
         going = np.flatnonzero(~result)
         start = np.zeros(len(origins), np.float32)
         for _ in range(MAX_LAYERS):
@@ -173,12 +200,13 @@ class World:
 def _paint(material: Material) -> tuple[float, float, float]:
     """SRGB by which a material's texture is multiplied; its colour if it has no texture.
 
-    Exporters leave any grey as the colour of textured surfaces, so only its hue counts.
+    Exporters leave any grey as the colour of textured surfaces, so only its hue counts, and only by
+    half.
     """
     if material.texture is None:
         return material.color
     brightest = max(material.color)
-    if brightest < 0.02:
+    if brightest < 0.02:  # black has no hue
         return 1.0, 1.0, 1.0
     red, green, blue = (0.5 + 0.5 * value / brightest for value in material.color)
     return red, green, blue
@@ -231,11 +259,13 @@ class _Tree:
 
 def _texel_density(mesh: Mesh, texture: Ints, pictures: Pyramids) -> Floats:
     """[F] texels per metre on each triangle; 0 without a texture."""
-    number = texture[mesh.material]
-    sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
+    number = texture[mesh.material]  # [F] of the picture
+    sides = mesh.corners[:, 1:] - mesh.corners[:, :1]  # [F, 2, 3] metres
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+
+    # The same triangle in the picture. Both areas are twice the triangle's, which cancels out.
     size = pictures.sizes[np.maximum(number, 0)]
-    flat = (mesh.uv[:, 1:] - mesh.uv[:, :1]) * size[:, None]
+    flat = (mesh.uv[:, 1:] - mesh.uv[:, :1]) * size[:, None]  # [F, 2, 2] texels
     flat_area = np.abs(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0])
     density = np.sqrt(flat_area / np.maximum(area, 1e-12))
     return np.where(number >= 0, density, 0.0).astype(np.float32)
@@ -252,11 +282,21 @@ def _normals(
     smooth: Any,
     flat: Any,
 ) -> None:
-    """Write the interpolated and the flat unit normals of hits, both towards the ray's origin."""
+    """Write the interpolated and the flat unit normals of hits, both towards the ray's origin.
+
+    Args:
+        corners, normals: [F, 3, 3] of all triangles.
+        triangle: [N] where the rays hit; negative for none.
+        u, v: [N] barycentric weights of the second and third corner.
+        directions: [N, 3] of the rays.
+        smooth, flat: [N, 3] outputs; left as they are for rays that hit nothing.
+    """
     for n in range(triangle.shape[0]):
         t = triangle[n]
         if t < 0:
             continue
+
+        # The flat normal (x, y, z) is the cross product of two sides.
         a = corners[t, 1] - corners[t, 0]
         b = corners[t, 2] - corners[t, 0]
         x = a[1] * b[2] - a[2] * b[1]
@@ -273,6 +313,8 @@ def _normals(
         flat[n, 0] = x
         flat[n, 1] = y
         flat[n, 2] = z
+
+        # The smooth normal (p, q, r) is the mean of those at the corners.
         w = 1.0 - u[n] - v[n]
         p = w * normals[t, 0, 0] + u[n] * normals[t, 1, 0] + v[n] * normals[t, 2, 0]
         q = w * normals[t, 0, 1] + u[n] * normals[t, 1, 1] + v[n] * normals[t, 2, 1]
@@ -312,7 +354,21 @@ def _albedo(
     to_linear: Any,
     out: Any,
 ) -> None:
-    """Write linear colour and coverage of hits to `out` [N, 4]."""
+    """Write linear colour and coverage of hits to `out` [N, 4].
+
+    Args:
+        triangle: [N] where the rays hit; negative for none, whose output is left as it is.
+        u, v: [N] barycentric weights of the second and third corner.
+        footprint_m: [N] width in metres of the area that a colour is the mean of.
+        uv: [F, 3, 2] texture coordinates of all triangles.
+        material: [F] of all triangles.
+        texture: [M] the number of a material's picture; negative for none.
+        color: [M, 3] linear colour of a material, which multiplies its picture.
+        density: [F] texels per metre.
+        texels, offsets, sizes, levels: all pictures, see `Pyramids`.
+        to_linear: [256] linear values of bytes.
+        out: [N, 4] red, green, blue and coverage.
+    """
     sample = np.zeros(4, np.float32)
     for n in range(triangle.shape[0]):
         t = triangle[n]

@@ -29,12 +29,14 @@ GATHER_RAYS = 32  # of a fine cell
 COARSE_RAYS = 24  # of a coarse cell
 PORTAL_RAYS = 16  # of a cell towards the windows
 LAMP_RAYS = 4  # of a cell towards each lamp
-BOUNCES = 6
+BOUNCES = 6  # how often light goes from coarse cells to coarse cells
 COARSE_SAMPLES = 12  # places at which sunlight is looked for, for each coarse cell on average
 EMPTY = -1
 MAX_RAY_RATIO = 4.0  # a ray may be this many times as bright as the mean of its cell
-# Noise of gathered light is about a fifth, and it varies slowly; that of direct light is less. The
-# first round takes any neighbour, so that single outliers vanish.
+# How the light of cells is smoothed against noise: rounds of (distance to the neighbours in cells,
+# share by which their light may differ before they count less). Noise of gathered light is about a
+# fifth, and it varies slowly; that of direct light is less. The first round takes any neighbour, so
+# that single outliers vanish.
 ANY = 1e3
 GATHERED_ROUNDS = ((1, ANY), (2, 0.6), (3, 0.5), (1, 0.5))
 DIRECT_ROUNDS = ((1, ANY), (2, 0.4), (1, 0.4))
@@ -43,12 +45,26 @@ CHUNK = 400_000  # rays at once
 
 @dataclasses.dataclass(frozen=True)
 class Cells:
-    """Cells by their keys, and what represents each."""
+    """Cubes in which surfaces lie, in a hash table, and a point of a surface for each.
 
-    table: Longs  # [2^k] keys, EMPTY where free
-    slots: Longs  # [2^k] the cell's number
+    A cell is one level (its width), one place and one of six sides, so that the two sides of a thin
+    wall are two cells.
+    """
+
+    table: Longs  # [2^k] keys of cells by their hash, EMPTY where free; see `_key`
+    slots: Longs  # [2^k] the number of the cell with this key
     position: Floats  # [C, 3] a point of a surface in the cell
     normal: Floats  # [C, 3]
+
+
+@dataclasses.dataclass(frozen=True)
+class _RayEnds:
+    """Where R rays from each of N points end, M of them on a surface."""
+
+    positions: Floats  # [M, 3]
+    normals: Floats  # [M, 3] flat unit normals, towards the point
+    triangles: NDArray[np.int32]  # [M]
+    missed: NDArray[np.bool_]  # [N · R] rays that end on no surface; those of a point in a row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,6 +140,9 @@ def solve(
 ) -> Irradiance:
     """Light on all surfaces that some views see.
 
+    What views see is divided into fine cells. The light on them comes directly from windows and
+    lamps, and from the surfaces around, which are divided into coarse cells.
+
     Args:
         world, lights: the world.
         rng: directions of rays.
@@ -135,59 +154,81 @@ def solve(
     angle = CELL_PX / focal_px
     levels = cell_levels(positions, eye, angle)
     cells = _cells(positions, normals, levels, BASE_CELL_M, both_levels=True)
-    count = len(cells.position)
 
     # Where the rays of fine cells end, there coarse cells are needed.
-    ends, end_normals, end_cell, missed = _gather(
-        world, rng, cells.position, cells.normal, GATHER_RAYS
-    )
-    fixed = coarse_m / 2.0**COARSE_LEVEL
-    every = np.full(len(ends), COARSE_LEVEL, np.float32)
-    coarse = _cells(ends, end_normals, every, fixed, both_levels=False)
-    link = _find(coarse, ends, end_normals, fixed)
-    albedo = _coarse_albedo(world, coarse, link, end_cell)
-    direct = _direct(world, lights, rng, coarse.position, coarse.normal)
-    direct += _sunlight(world, lights, rng, ends, end_normals, link, len(coarse.position))
+    ends = _gather(world, rng, cells.position, cells.normal, GATHER_RAYS)
+    coarse_base_m = coarse_m / 2.0**COARSE_LEVEL  # the level then makes cells `coarse_m` wide
+    coarse_levels = np.full(len(ends.positions), COARSE_LEVEL, np.float32)
+    coarse = _cells(ends.positions, ends.normals, coarse_levels, coarse_base_m, both_levels=False)
+    cell_of_end = _find(coarse, ends.positions, ends.normals, coarse_base_m)
 
-    # Coarse cells light each other.
-    coarse_ends, coarse_normals, coarse_hit, coarse_missed = _gather(
-        world, rng, coarse.position, coarse.normal, COARSE_RAYS
-    )
-    known = np.full(len(coarse_missed), EMPTY, np.int64)
-    known[~coarse_missed] = _find(coarse, coarse_ends, coarse_normals, fixed)
-    del coarse_hit
-    sky = _sky_light(lights, world, rng, coarse.position, coarse.normal, coarse_missed, COARSE_RAYS)
-    table = known.reshape(-1, COARSE_RAYS)
-    light = direct + sky
-    mean_reflected = _mean(albedo * light)
-    for _ in range(BOUNCES):
-        reflected = np.concatenate([albedo * light, mean_reflected[None]])
-        seen = np.where(table >= 0, table, len(coarse.position))
-        gathered = reflected[seen] * (~coarse_missed.reshape(-1, COARSE_RAYS))[..., None]
-        light = direct + sky + gathered.mean(1) + math.pi * lights.ambient
-        mean_reflected = _mean(albedo * light)
+    # Light on coarse cells.
+    albedo = _coarse_albedo(world, coarse, cell_of_end, ends.triangles)
+    coarse_direct = _direct(world, lights, rng, coarse.position, coarse.normal)
+    coarse_direct += _sunlight(world, lights, rng, ends, cell_of_end, len(coarse.position))
+    coarse_light = _bounced(world, lights, rng, coarse, coarse_base_m, albedo, coarse_direct)
 
-    # Fine cells gather from coarse ones.
-    fine_link = np.full(len(missed), EMPTY, np.int64)
-    fine_link[~missed] = link
-    reflected = np.concatenate([albedo * light, np.zeros((1, 3), np.float32)])
-    gathered = _calm_mean(reflected[fine_link.reshape(count, GATHER_RAYS)])
+    # Fine cells gather from coarse ones. Rays that end nowhere have the number EMPTY, which is −1:
+    # the last row of `reflected`, where nothing shines.
+    cell_of_ray = np.full(len(ends.missed), EMPTY, np.int64)
+    cell_of_ray[~ends.missed] = cell_of_end
+    reflected = np.concatenate([albedo * coarse_light, np.zeros((1, 3), np.float32)])
+    gathered = _calm_mean(reflected[cell_of_ray.reshape(len(cells.position), GATHER_RAYS)])
     gathered = gathered + math.pi * lights.ambient
-    gathered += _sky_light(lights, world, rng, cells.position, cells.normal, missed, GATHER_RAYS)
+    gathered += _sky_light(lights, cells.normal, ends.missed, GATHER_RAYS)
     gathered = _smoothed(cells, gathered.astype(np.float32), GATHERED_ROUNDS)
     direct = _direct(world, lights, rng, cells.position, cells.normal)
     direct = _smoothed(cells, direct, DIRECT_ROUNDS)
     total = gathered + direct
     return Irradiance(
-        cells,
-        total.astype(np.float32),
-        coarse,
-        light.astype(np.float32),
-        coarse_m,
-        eye.astype(np.float32),
-        angle,
-        total.mean(0).astype(np.float32),
+        cells=cells,
+        light=total.astype(np.float32),
+        coarse=coarse,
+        coarse_light=coarse_light.astype(np.float32),
+        coarse_m=coarse_m,
+        eye=eye.astype(np.float32),
+        angle=angle,
+        mean=total.mean(0).astype(np.float32),
     )
+
+
+def _bounced(
+    world: World,
+    lights: Lights,
+    rng: np.random.Generator,
+    coarse: Cells,
+    base_m: float,
+    albedo: Floats,
+    direct: Floats,
+) -> Floats:
+    """[C, 3] irradiance of coarse cells, which light each other several times.
+
+    Args:
+        world, lights: the world.
+        rng: directions of rays.
+        coarse: the C cells.
+        base_m: width of cells at level 0, see `_find`.
+        albedo: [C, 3] share of light that they reflect.
+        direct: [C, 3] irradiance from windows, lamps and the sun.
+    """
+    ends = _gather(world, rng, coarse.position, coarse.normal, COARSE_RAYS)
+    has_missed = ends.missed.reshape(-1, COARSE_RAYS)
+    cell_of_ray = np.full(len(ends.missed), EMPTY, np.int64)
+    cell_of_ray[~ends.missed] = _find(coarse, ends.positions, ends.normals, base_m)
+    table = cell_of_ray.reshape(-1, COARSE_RAYS)  # [C, R] the cell that each ray meets
+    # Surfaces that no view's rays have met have no cell. They shine as the mean of all cells, which
+    # is the last row of `reflected`.
+    table = np.where(table >= 0, table, len(coarse.position))
+
+    sky = _sky_light(lights, coarse.normal, ends.missed, COARSE_RAYS)
+    light = direct + sky
+    mean_reflected = _mean(albedo * light)
+    for _ in range(BOUNCES):
+        reflected = np.concatenate([albedo * light, mean_reflected[None]])
+        gathered = reflected[table] * (~has_missed)[..., None]
+        light = direct + sky + gathered.mean(1) + math.pi * lights.ambient
+        mean_reflected = _mean(albedo * light)
+    return light
 
 
 def _calm_mean(light: Floats) -> Floats:
@@ -209,9 +250,17 @@ def _mean(values: Floats) -> Floats:
 def _cells(
     positions: Floats, normals: Floats, levels: Floats, base_m: float, *, both_levels: bool
 ) -> Cells:
-    """One cell for each place and side of the given points; the point nearest its middle stands
-    for it.
+    """The cells in which points lie; the point nearest a cell's middle stands for the cell.
+
+    Args:
+        positions, normals: [N, 3] the points, and their unit normals.
+        levels: [N] the level of each point's cell; `base_m` is the width at level 0.
+        base_m: metres.
+        both_levels: whether each point gets a cell of the next level, too, because light is
+            interpolated between the two.
     """
+    # A power of two, at least 1.6 times as large as the number of points, so that hashes seldom
+    # meet.
     room = 1 << max(10, int(len(positions) * 1.6).bit_length())
     table = np.full(room, EMPTY, np.int64)
     slots = np.zeros(room, np.int64)
@@ -232,21 +281,17 @@ def _find(cells: Cells, positions: Floats, normals: Floats, base_m: float) -> Lo
 
 def _gather(
     world: World, rng: np.random.Generator, positions: Floats, normals: Floats, rays: int
-) -> tuple[Floats, Floats, tuple[Any, Any, Any], NDArray[np.bool_]]:
+) -> _RayEnds:
     """Send `rays` rays from each point, more along the normal than sideways.
 
-    Returns:
-        Positions and normals of the ends [M, 3]; triangle and barycentric weights of the ends;
-        and [N · rays] which rays end nowhere.
+    `positions` and `normals` are [N, 3]. The result has the ends of the rays.
     """
     # Empty arrays come first, because there may be no points, or no surface around them.
     ends: list[Floats] = [np.zeros((0, 3), np.float32)]
-    sides: list[Floats] = [np.zeros((0, 3), np.float32)]
+    end_normals: list[Floats] = [np.zeros((0, 3), np.float32)]
     triangles: list[NDArray[np.int32]] = [np.zeros(0, np.int32)]
-    us: list[Floats] = [np.zeros(0, np.float32)]
-    vs: list[Floats] = [np.zeros(0, np.float32)]
     missed: list[NDArray[np.bool_]] = [np.zeros(0, bool)]
-    step = max(1, CHUNK // rays)
+    step = max(1, CHUNK // rays)  # points at once
     for first in range(0, len(positions), step):
         part = slice(first, first + step)
         directions = hemisphere(rng, normals[part], rays).reshape(-1, 3)
@@ -255,24 +300,25 @@ def _gather(
         met = hits.triangle >= 0
         _, flat = world.normals(hits, directions)
         ends.append((origins + hits.distance[:, None] * directions)[met])
-        sides.append(flat[met])
+        end_normals.append(flat[met])
         triangles.append(hits.triangle[met])
-        us.append(hits.u[met])
-        vs.append(hits.v[met])
         missed.append(~met)
-    return (
-        np.concatenate(ends).astype(np.float32),
-        np.concatenate(sides),
-        (np.concatenate(triangles), np.concatenate(us), np.concatenate(vs)),
-        np.concatenate(missed),
+    return _RayEnds(
+        positions=np.concatenate(ends).astype(np.float32),
+        normals=np.concatenate(end_normals),
+        triangles=np.concatenate(triangles),
+        missed=np.concatenate(missed),
     )
 
 
 def hemisphere(rng: np.random.Generator, normals: Floats, rays: int) -> Floats:
-    """[N, rays, 3] unit vectors around unit normals [N, 3], with a density as their cosine.
+    """[N, rays, 3] unit vectors around unit normals [N, 3].
 
-    The rays of one point are spread evenly, by a spiral that is turned at random.
+    Their density is proportional to the cosine of the angle to the normal, so the mean light of
+    rays is the irradiance over π. The rays of one point are spread evenly, by a spiral that is
+    turned at random.
     """
+    # Points that are spread evenly in a disc, lifted to the hemisphere above it, have this density.
     number = (np.arange(rays) + rng.random((len(normals), 1))) / rays
     turn = rng.random((len(normals), 1)) * 2 * math.pi
     azimuth = turn + np.arange(rays) * 2.399963  # the golden angle
@@ -301,17 +347,25 @@ def tangents(normals: Floats) -> tuple[Floats, Floats]:
     return first.astype(np.float32), second.astype(np.float32)
 
 
-def _coarse_albedo(world: World, coarse: Cells, link: Longs, ends: tuple[Any, Any, Any]) -> Floats:
-    """[C, 3] mean linear colour of the surfaces in coarse cells."""
-    triangle, _, _ = ends
-    material = world.mesh.material[triangle]
+def _coarse_albedo(
+    world: World, coarse: Cells, cell_of_end: Longs, triangles: NDArray[np.int32]
+) -> Floats:
+    """[C, 3] mean linear colour of the surfaces in coarse cells.
+
+    Args:
+        world: has the colours.
+        coarse: the C cells.
+        cell_of_end: [M] the cell in which each ray ends.
+        triangles: [M] the triangle on which it ends.
+    """
+    material = world.mesh.material[triangles]
     number = np.maximum(world.texture[material], 0)
     textured = world.texture[material] >= 0
     means = np.where(textured[:, None], world.pyramids.mean[number], 1.0)
     colors = world.color[material] * means
     count = len(coarse.position)
-    weights = np.bincount(link, minlength=count)
-    sums = [np.bincount(link, colors[:, k], minlength=count) for k in range(3)]
+    weights = np.bincount(cell_of_end, minlength=count)
+    sums = [np.bincount(cell_of_end, colors[:, k], minlength=count) for k in range(3)]
     return (np.stack(sums, -1) / np.maximum(weights, 1)[:, None]).astype(np.float32)
 
 
@@ -332,20 +386,27 @@ def _direct(
 def _from_portals(
     world: World, lights: Lights, rng: np.random.Generator, positions: Floats, normals: Floats
 ) -> Floats:
-    """[N, 3] irradiance from the sky through the windows."""
+    """[N, 3] irradiance from the sky through the windows, at points [N, 3] with unit normals.
+
+    Each window is a grid of parts, with a ray to a random point of each part. The irradiance is the
+    sum of radiance · cosine at the point · cosine at the window · area / distance².
+    """
     count = len(lights.portals)
     total = np.zeros((len(positions), 3), np.float32)
     if not count:
         return total
-    each = max(9, PORTAL_RAYS // count)
+    each = max(9, PORTAL_RAYS // count)  # rays to a window, at least 3 × 3
     grid = math.ceil(math.sqrt(each))
     for corner, side, other in lights.portals:
+        # Only points on the window's inner side get light from it.
         area_normal = np.cross(side, other)
         area = float(np.linalg.norm(area_normal))
         area_normal = area_normal / area
         facing = (((positions - (corner + side / 2 + other / 2)) @ area_normal) > 0.0).nonzero()[0]
         if not len(facing):
             continue
+
+        # [F, parts, 3] the points of the window, and the ways to them.
         cells = grid * grid
         place = np.arange(cells)
         a = (place % grid + rng.random((len(facing), cells))) / grid
@@ -357,12 +418,15 @@ def _from_portals(
         cosine = (directions * normals[facing, None]).sum(-1)
         other_cosine = -(directions @ area_normal.astype(np.float32))
         use = (cosine > 0) & (other_cosine > 0)
+
+        # Which ways are open.
         origins = np.broadcast_to(
             (positions[facing] + NUDGE_M * 4 * normals[facing])[:, None], ways.shape
         )
         open_way = np.zeros(use.shape, bool)
         # A curtain outside of the window's plane blocks as well, so the ray goes on a little.
         open_way[use] = ~world.blocked(origins[use], directions[use], distance[use] + 0.3)
+        # Nearer than 5 cm, the sum would be grainy.
         weight = cosine * other_cosine * area / np.maximum(distance, 0.05) ** 2 / cells
         weight = np.where(open_way, weight, 0.0)
         radiance = lights.sky_radiance(directions.reshape(-1, 3)).reshape(*use.shape, 3)
@@ -378,7 +442,11 @@ def _from_lamp(
     normals: Floats,
     number: int,
 ) -> Floats:
-    """[N, 3] irradiance from one lamp, a ball; the lamp's own body does not shade it."""
+    """[N, 3] irradiance from the lamp with this number, a ball.
+
+    The lamp's own body does not shade it: rays end at one and a half times the ball's radius.
+    """
+    # [N, LAMP_RAYS, 3] random points of the ball's surface, and the ways to them.
     radius = float(lights.lamp_radii[number])
     jitter = rng.standard_normal((len(positions), LAMP_RAYS, 3))
     jitter *= radius / np.maximum(np.linalg.norm(jitter, axis=-1, keepdims=True), 1e-6)
@@ -394,6 +462,7 @@ def _from_lamp(
     open_way[use] = ~world.blocked(
         origins[use].astype(np.float32), directions[use], reach[use].astype(np.float32)
     )
+    # Light falls with the square of the distance, but not without end close to the lamp.
     falloff = np.where(open_way, cosine / np.maximum(distance, 2 * radius) ** 2, 0.0).mean(1)
     return np.asarray(falloff[:, None] * lights.lamp_colors[number], np.float32)
 
@@ -402,24 +471,34 @@ def _sunlight(
     world: World,
     lights: Lights,
     rng: np.random.Generator,
-    ends: Floats,
-    normals: Floats,
-    link: Longs,
+    ends: _RayEnds,
+    cell_of_end: Longs,
     count: int,
 ) -> Floats:
-    """[count, 3] mean irradiance from the sun on coarse cells, at a few points of each."""
+    """[count, 3] mean irradiance from the sun on coarse cells, at a few points of each.
+
+    Args:
+        world, lights: the world.
+        rng: chooses points, and directions within the sun's disc.
+        ends: where the rays of fine cells end; some of these points are taken.
+        cell_of_end: [M] the coarse cell in which each lies.
+        count: number of coarse cells.
+    """
     total = np.zeros((count, 3), np.float32)
     if not lights.sun_color.any() or not count:
         return total
     # Cells at which many rays end matter more, and get more samples.
-    chosen = rng.integers(len(ends), size=COARSE_SAMPLES * count)
+    chosen = rng.integers(len(ends.positions), size=COARSE_SAMPLES * count)
     spread = rng.standard_normal((len(chosen), 3)) * lights.sun_spread / 2
     directions = lights.sun_direction + spread
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    seen = sun_on(world, directions.astype(np.float32), ends[chosen], normals[chosen])
-    tallies = np.bincount(link[chosen], minlength=count)
-    sums = np.bincount(link[chosen], seen, minlength=count) / np.maximum(tallies, 1)
-    return np.asarray(sums[:, None] * lights.sun_color, np.float32)
+    cosines = sun_on(
+        world, directions.astype(np.float32), ends.positions[chosen], ends.normals[chosen]
+    )
+    cells = cell_of_end[chosen]
+    sample_counts = np.bincount(cells, minlength=count)
+    mean_cosines = np.bincount(cells, cosines, minlength=count) / np.maximum(sample_counts, 1)
+    return np.asarray(mean_cosines[:, None] * lights.sun_color, np.float32)
 
 
 def sun_on(world: World, directions: Floats, positions: Floats, normals: Floats) -> Floats:
@@ -441,22 +520,20 @@ def sun_on(world: World, directions: Floats, positions: Floats, normals: Floats)
     return lit
 
 
-def _sky_light(
-    lights: Lights,
-    world: World,
-    rng: np.random.Generator,
-    positions: Floats,
-    normals: Floats,
-    missed: NDArray[np.bool_],
-    rays: int,
-) -> Floats:
+def _sky_light(lights: Lights, normals: Floats, missed: NDArray[np.bool_], rays: int) -> Floats:
     """[N, 3] irradiance of the open sky, from the share of rays that end nowhere.
 
-    Behind windows the sky is sampled directly, so it does not count again.
+    A room with windows gets its sky through them, by `_from_portals`, and here nothing.
+
+    Args:
+        lights: the sky and the windows.
+        normals: [N, 3] of the points.
+        missed: [N · rays] rays that end nowhere.
+        rays: of each point.
     """
-    del world, rng
     if len(lights.portals):
-        return np.zeros((len(positions), 3), np.float32)
+        return np.zeros((len(normals), 3), np.float32)
+    # The mean of the sky's upper half. It is darker for walls, which see land as well.
     openness = missed.reshape(-1, rays).mean(1)
     above = lights.sky[: lights.sky.shape[0] // 2].mean((0, 1))
     side = 0.6 + 0.4 * np.maximum(normals[:, 2], 0)
@@ -483,15 +560,20 @@ def _smoothed(cells: Cells, light: Floats, rounds: tuple[tuple[int, float], ...]
     return light
 
 
-OFFSET = 1 << 17  # of cell coordinates, so that they are not negative
+COORDINATE_BITS = 18  # of each of a cell's three coordinates in its key
+OFFSET = 1 << (COORDINATE_BITS - 1)  # of cell coordinates, so that they are not negative
+COORDINATE_MASK = (1 << COORDINATE_BITS) - 1
+POSITIVE = 0x7FFFFFFFFFFFFFFF  # all bits of 64 but the sign
+HASH_FACTOR = 0x1E3779B97F4A7C15  # odd, with irregular bits: near keys get far places
 
 
 @kernel
 def _key(level: int, x: int, y: int, z: int, side: int) -> int:
-    """One number for a cell: its level, place and side."""
-    return (
-        (((((level << 18) | (x + 131072)) << 18) | (y + 131072)) << 18 | (z + 131072)) * 8 + side
-    ) & 0x7FFFFFFFFFFFFFFF
+    """One number for a cell: its level, place (18 bits a coordinate) and side (the last 3 bits)."""
+    key = (level << COORDINATE_BITS) | (x + OFFSET)
+    key = (key << COORDINATE_BITS) | (y + OFFSET)
+    key = (key << COORDINATE_BITS) | (z + OFFSET)
+    return (key * 8 + side) & POSITIVE
 
 
 @kernel
@@ -509,10 +591,11 @@ def _side(x: float, y: float, z: float) -> int:
 
 @kernel
 def _slot(table: Any, key: int) -> Any:
-    """The place of a key in the table, or the free place where it belongs."""
+    """The place of a key in the hash table, or the free place where it belongs."""
     mask = table.shape[0] - 1
-    mixed = key * 0x1E3779B97F4A7C15
-    place = (mixed >> 20) & mask
+    mixed = key * HASH_FACTOR
+    place = (mixed >> 20) & mask  # the upper bits are mixed best
+    # Where another key stands already, the next place is taken.
     while table[place] != -1 and table[place] != key:
         place = (place + 1) & mask
     return place
@@ -530,7 +613,18 @@ def _insert(
     base: float,
     both_levels: bool,
 ) -> int:
-    """Fill the table with the cells of points; returns the number of cells."""
+    """Fill the table with the cells of points; returns the number of cells.
+
+    Args:
+        table, slots: outputs, see `Cells`.
+        best: [cells] becomes the squared distance of the nearest point to the cell's middle, in
+            cells; infinite at first.
+        chosen: [cells] becomes the index of this point.
+        positions, normals: [N, 3] the points, and their unit normals.
+        levels: [N] of the points' cells.
+        base: width of a cell at level 0.
+        both_levels: whether each point also gets a cell of the next level.
+    """
     count = 0
     for n in range(positions.shape[0]):
         low = int(levels[n])
@@ -546,6 +640,8 @@ def _insert(
                 table[place] = key
                 slots[place] = count
                 count += 1
+
+            # The point nearest the middle stands for the cell.
             cell = slots[place]
             dx = positions[n, 0] / size - x - 0.5
             dy = positions[n, 1] / size - y - 0.5
@@ -591,6 +687,15 @@ def _interpolate(
 
     Cells count by their distance, by how far their surface's plane is from the point, and by
     the angle between the normals.
+
+    Args:
+        table, slots, cell_position, cell_normal: the cells, see `Cells`.
+        light: [C, 3] of the cells.
+        positions, normals: [N, 3] the points, and their unit normals.
+        levels: [N] as fractions: between two levels, both count.
+        base: width of a cell at level 0.
+        fallback: [3] where there is no cell.
+        result: [N, 3] output.
     """
     for n in range(positions.shape[0]):
         low = int(levels[n])
@@ -612,7 +717,8 @@ def _interpolate(
             share = 1.0
             if steps == 2:
                 share = fraction if step == 1 else 1.0 - fraction
-            share += 1e-3
+            share += 1e-3  # so that a point whose cells are all of one level finds them
+            # The eight cells whose middles surround the point begin at (x0, y0, z0).
             gx = px / size - 0.5
             gy = py / size - 0.5
             gz = pz / size - 0.5
@@ -627,6 +733,7 @@ def _interpolate(
                 wy = gy - y0 if j == 1 else 1.0 - gy + y0
                 wz = gz - z0 if k == 1 else 1.0 - gz + z0
                 near = wx * wy * wz + 1e-3
+                # A slanted surface may lie in cells of two or three sides.
                 for axis in range(3):
                     along = nx if axis == 0 else (ny if axis == 1 else nz)
                     if abs(along) < 0.25:
@@ -679,18 +786,31 @@ def _smooth(
     tolerance: float,
     result: Any,
 ) -> None:
-    """Write the mean light of each cell and its 26 neighbours of the same level and side."""
+    """Write the mean light of each cell and its 26 neighbours of the same level and side.
+
+    Neighbours count less if they lie out of the cell's plane, face another way, or differ in their
+    light by more than `tolerance` (as a share); so edges and shadows stay.
+
+    Args:
+        table, slots, cell_position, cell_normal: the cells, see `Cells`.
+        light: [C, 3] of the cells.
+        base: width of a cell at level 0.
+        stride: distance to the neighbours, in cells.
+        tolerance: share by which their light may differ.
+        result: [C, 3] output.
+    """
     for place in range(table.shape[0]):
         key = table[place]
         if key == -1:
             continue
         cell = slots[place]
+        # Back from the key to the side, the coordinates and the level; see `_key`.
         side = key & 7
         rest = key >> 3
-        z = (rest & 0x3FFFF) - 131072
-        y = ((rest >> 18) & 0x3FFFF) - 131072
-        x = ((rest >> 36) & 0x3FFFF) - 131072
-        level = rest >> 54
+        z = (rest & COORDINATE_MASK) - OFFSET
+        y = ((rest >> COORDINATE_BITS) & COORDINATE_MASK) - OFFSET
+        x = ((rest >> (2 * COORDINATE_BITS)) & COORDINATE_MASK) - OFFSET
+        level = rest >> (3 * COORDINATE_BITS)
         size = base * 2.0**level
         red = 0.0
         green = 0.0

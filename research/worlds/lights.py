@@ -91,6 +91,8 @@ def made_sky(
     up = directions[..., 2:]
     grey = rng.uniform(0, 1) ** 0.7  # 0: clear, 1: overcast
 
+    # From blue at the zenith to pale at the horizon, with a wide and a narrow glow around the sun,
+    # and clouds.
     zenith = np.array([0.25, 0.45, 0.85]) * rng.uniform(0.6, 1.1)
     horizon = np.array([0.85, 0.92, 1.0]) * rng.uniform(0.9, 1.3)
     overcast = np.array([0.9, 0.93, 1.0]) * rng.uniform(0.7, 1.2)
@@ -126,6 +128,8 @@ def _with_backdrop(
     y = (np.arange(rows) * photo.shape[0] / rows).astype(int)
     x = (np.arange(columns) * photo.shape[1] / columns).astype(int)
     small = srgb_to_linear(photo[y][:, x, :3] / 255) * rng.uniform(0.9, 1.6)
+    # Four times around the horizon, every other time mirrored, so that there is no seam. The upper
+    # and lower border of 12 rows fade.
     strip = np.concatenate([small, small[:, ::-1]] * 2, 1)
     top = height // 2 - int(rows * rng.uniform(0.45, 0.65))
     fade = np.clip(np.minimum(np.arange(rows), rows - 1 - np.arange(rows)) / 12, 0, 1)

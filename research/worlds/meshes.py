@@ -79,9 +79,10 @@ class Mesh:
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles of several meshes in one mesh; equal materials become one."""
-    numbers: dict[Material, int] = {}
+    numbers: dict[Material, int] = {}  # of distinct materials
     indices = []
     for mesh in meshes:
+        # The new number of each of this mesh's materials.
         table = [numbers.setdefault(material, len(numbers)) for material in mesh.materials]
         indices.append(np.array(table, np.int32)[mesh.material])
     return Mesh(
@@ -118,8 +119,10 @@ def smooth_normals(corners: NDArray[np.floating]) -> Floats:
     _, place = np.unique(rounded, axis=0, return_inverse=True)
     place = place.reshape(-1)
 
-    # Two rounds: first the mean over all faces at a place, then for each corner the mean over the
-    # faces near its own direction. Pairs of faces would be exact, but too many in fans of faces.
+    # For each corner, the sum over the faces at its place that look roughly the same way. Pairs of
+    # faces would tell this exactly, but a fan of faces has too many pairs. So faces are sorted into
+    # 26 directions, and all corners of a direction share the sums over the faces near it. The limit
+    # is lower than for a pair, because a face may lie at the edge of its direction.
     face = np.repeat(np.arange(len(corners)), 3)
     bins = _direction_bins(own_unit)
     result = np.zeros((len(points), 3))

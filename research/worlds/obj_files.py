@@ -42,14 +42,15 @@ def read_obj(text: str, folder: str, read_file: ReadFile) -> Mesh:
         ValueError: the file has no triangles, or a number in it cannot be read.
     """
     points: list[list[float]] = []
-    textures: list[list[float]] = []
+    textures: list[list[float]] = []  # coordinates in pictures
     normals: list[list[float]] = []
     corner_indices: list[tuple[int, int, int]] = []  # three a triangle
-    face_materials: list[int] = []
-    names: dict[str, int] = {}
-    materials: dict[str, Material] = {}
-    current = names.setdefault("", 0)
+    face_materials: list[int] = []  # a triangle's number in `names`
+    names: dict[str, int] = {}  # of materials that faces use, with their numbers
+    materials: dict[str, Material] = {}  # that MTL files describe
+    current = names.setdefault("", 0)  # faces before any `usemtl`
 
+    # A backslash continues a line.
     for line in text.replace("\\\n", " ").splitlines():
         words = line.split()
         if not words:
@@ -64,12 +65,14 @@ def read_obj(text: str, folder: str, read_file: ReadFile) -> Mesh:
         elif kind == "f":
             counts = (len(points), len(textures), len(normals))
             corners = [_corner(word, counts) for word in words[1:]]
+            # A fan: the first corner with each two neighbours.
             for second, third in itertools.pairwise(corners[1:]):
                 corner_indices += [corners[0], second, third]
                 face_materials.append(current)
         elif kind == "usemtl":
             current = names.setdefault(" ".join(words[1:]), len(names))
         elif kind == "mtllib":
+            # A line may name several files, or one with spaces in its name.
             for name in {" ".join(words[1:]), *words[1:]}:
                 content = read_file(posixpath.join(folder, name))
                 if content is not None:
@@ -79,12 +82,12 @@ def read_obj(text: str, folder: str, read_file: ReadFile) -> Mesh:
         raise ValueError("no triangles")
     index = np.array(corner_indices, np.int64).reshape(-1, 3, 3)  # [F, corner, (v, vt, vn)]
     material = np.array(face_materials, np.int32)
-    corners_all = np.array(points, np.float64)
+    all_points = np.array(points, np.float64)
 
-    # Faces with corners that do not exist, or without area.
+    # Faces with corners that do not exist, or without area, are left out.
     exists = (index[..., 0] >= 0) & (index[..., 0] < len(points))
     whole = np.asarray(exists.all(1))
-    xyz = corners_all[np.where(whole[:, None], index[..., 0], 0)]
+    xyz = all_points[np.where(whole[:, None], index[..., 0], 0)]
     crossed = np.cross(xyz[:, 1] - xyz[:, 0], xyz[:, 2] - xyz[:, 0])
     whole &= np.linalg.norm(crossed, axis=1) > 0
     whole &= (np.abs(xyz) < MAX_COORDINATE).all((1, 2))
@@ -107,11 +110,11 @@ def read_obj(text: str, folder: str, read_file: ReadFile) -> Mesh:
 def _corner(word: str, counts: tuple[int, int, int]) -> tuple[int, int, int]:
     """Indices from 0 of "v/vt/vn"; −1 for a missing one. Negative numbers count from the end."""
     parts = [*word.split("/"), "", ""][:3]
-    found = []
+    indices = []
     for part, count in zip(parts, counts, strict=True):
-        number = int(part) if part else 0
-        found.append(number - 1 if number >= 0 else count + number)
-    return found[0], found[1], found[2]
+        number = int(part) if part else 0  # the file counts from 1, so 0 becomes −1
+        indices.append(number - 1 if number >= 0 else count + number)
+    return indices[0], indices[1], indices[2]
 
 
 def _normals(
@@ -122,6 +125,7 @@ def _normals(
     """[F, 3, 3] the file's normals, or new ones where it has none."""
     if not normals:
         return smooth_normals(xyz)
+    # Corners without a normal get the last row, which is none, and is repaired.
     table = np.array([*normals, [0.0, 0.0, 0.0]], np.float64)
     known = (index >= 0) & (index < len(normals))
     return repaired_normals(xyz, table[np.where(known, index, len(normals))])

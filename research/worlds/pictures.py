@@ -57,6 +57,7 @@ class Pyramids:
 
 def pyramids(pictures: Sequence[Bytes]) -> Pyramids:
     """Build the pyramids of pictures [H, W, 3 or 4]."""
+    # At least one entry, because compiled code cannot index empty arrays.
     parts: list[Bytes] = []
     offsets = np.zeros((max(1, len(pictures)), MAX_LEVELS), np.int64)
     sizes = np.ones((max(1, len(pictures)), 2), np.int32)
@@ -159,6 +160,7 @@ def fetch(
         footprint: the width of the seen area in texels of level 0.
         out: [4] becomes red, green, blue and coverage.
     """
+    # At level k a texel is 2^k wide.
     level = np.log2(max(footprint, 1.0))
     level = min(level, levels - 1.0)
     low = int(level)
@@ -171,9 +173,11 @@ def fetch(
             continue
         width = size[0]
         height = size[1]
+        # Odd sides are rounded up; see `_halved`.
         for _ in range(at):
             width = (width + 1) // 2
             height = (height + 1) // 2
+        # The four texels around the point, with bilinear weights. The modulus repeats the picture.
         x = u * width - 0.5
         y = (1.0 - v) * height - 0.5
         x_floor = np.floor(x)

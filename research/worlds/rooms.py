@@ -18,6 +18,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +103,10 @@ class Builder:
 
 
 def _openings(rng: Rng, width: float, depth: float, height: float, small: bool) -> list[Opening]:
-    """Windows in one or two walls, and a door or passage in another."""
+    """Windows in one or two walls, and a door or passage in another.
+
+    Width, depth and height of the room are in metres; `small` rooms have windows in one wall only.
+    """
     walls = list(WALLS)
     rng.shuffle(walls)
     openings: list[Opening] = []
@@ -110,31 +114,34 @@ def _openings(rng: Rng, width: float, depth: float, height: float, small: bool) 
     for wall in walls[: 1 if small else int(rng.choice([1, 2], p=[0.6, 0.4]))]:
         length = lengths[wall]
         count = 1 if length < 3.5 else int(rng.integers(1, 4))
+        # A quarter of the windows reach to the floor.
         bottom = float(rng.choice([0.02, rng.uniform(0.5, 1.1)], p=[0.25, 0.75]))
         top = min(height - 0.12, rng.uniform(1.9, 2.5))
+        # Each window stands in the middle of an equal part of the wall.
         each = length / count
         window = min(rng.uniform(0.7, 2.4), each - 0.4)
         for number in range(count):
             start = each * number + (each - window) / 2
             openings.append(Opening(wall, start, window, bottom, top, "window"))
+
+    # At most two walls have windows, so the third in the random order has none.
     door_wall = walls[2]
     length = lengths[door_wall]
     wide = rng.uniform(0.8, 0.95)
-    kind = "door"
+    kind: Literal["door", "passage"] = "door"
     if rng.random() < 0.45:
         wide = min(rng.uniform(0.9, 2.4), length - 0.5)
         kind = "passage"
     start = rng.uniform(0.15, max(0.16, length - wide - 0.15))
     top = min(2.08, height - 0.1)
-    openings.append(
-        Opening(door_wall, start, wide, 0.0, top, "door" if kind == "door" else "passage")
-    )
+    openings.append(Opening(door_wall, start, wide, 0.0, top, kind))
     return openings
 
 
 def furnish(rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None) -> WorldPlan:
     """A furnished room with its light."""
     room = Builder(rng, furniture, cache, photo)
+    # Things find their places first, because pictures and lamps depend on them.
     RULES[room.kind](room)
     _everywhere(room)
     _build_shell(room)
@@ -153,6 +160,7 @@ def _living(room: Builder) -> None:
     find = room.furniture.of
     sofa = place.at_wall(find("sofa"), gap=rng.choice([0.03, rng.uniform(0.1, 0.8)]))
     if sofa is not None:
+        # Points are given as (sideways, forward) of the sofa's middle.
         depth = sofa.model.entry.size_m[1]
         front = sofa.beside(0.0, depth / 2 + rng.uniform(0.5, 0.8))
         _rug(room, sofa.beside(0.0, depth / 2 + 0.4), sofa.angle)
@@ -166,14 +174,14 @@ def _living(room: Builder) -> None:
                 place.on_floor(
                     find("armchair"), where, 0.1, sofa.angle - side * rng.uniform(50, 100)
                 )
+            # A small table at the sofa's end, with a lamp.
             if rng.random() < 0.5:
                 beside = sofa.beside(side * (sofa.model.entry.size_m[0] / 2 + 0.35), 0.0)
                 small = place.on_floor(find("bedside"), beside, 0.0, sofa.angle, tries=3)
                 if small is not None:
                     place.on_top(small, find("table_lamp"), 1)
         place.on_top(sofa, find("pet") + find("sitting_person"), int(rng.random() < 0.2))
-        opposite = _opposite(sofa.angle)
-        stand = place.at_wall(find("tv_stand"), opposite)
+        stand = place.at_wall(find("tv_stand"), _opposite(sofa.angle))
         if stand is not None:
             place.on_top(stand, find("tv"), 1, at=(0.0, 0.0))
             place.on_top(stand, find("living_small") + find("vase"), 3)
@@ -194,6 +202,7 @@ def _bedroom(room: Builder) -> None:
     if bed is not None:
         width, depth, _ = bed.model.entry.size_m
         _rug(room, bed.beside(rng.normal(0, 0.4), depth / 2), bed.angle)
+        # Both small tables are of one kind.
         table = find("bedside")
         chosen = [table[int(rng.integers(len(table)))]] if table else []
         for side in (-1, 1):
@@ -232,6 +241,8 @@ def _kitchen(room: Builder) -> None:
     walls = list(WALLS)
     rng.shuffle(walls)
     for wall in walls[: int(rng.choice([1, 2], p=[0.4, 0.6]))]:
+        # Cabinets stand side by side from the wall's left end; fridge, sink, stove and washer come
+        # in between, each once.
         length = place.length(wall)
         along = 0.02 if rng.random() < 0.5 else rng.uniform(0.05, 0.6)
         special = [find("fridge"), find("sink"), find("stove"), find("washer")]
@@ -246,13 +257,16 @@ def _kitchen(room: Builder) -> None:
                 break
             thing = place.at_wall([model], wall, along + width / 2, margin=-0.01)
             if thing is not None:
+                # Low ones carry small things, and have another cabinet or a hood above.
                 if model.entry.size_m[2] < 1.0:
                     place.on_top(thing, find("kitchen_small"), int(rng.integers(0, 4)))
                 above = upper if group is not find("stove") else find("hood")
                 if rng.random() < 0.75 and model.entry.size_m[2] < 1.3 and above:
                     chosen = above[int(rng.integers(len(above)))]
                     place.at_wall([chosen], wall, along + width / 2, z=1.45, margin=-0.02)
-            along += width + 0.002
+            along += width + 0.002  # a joint of 2 mm
+
+    # A block in the middle of the room.
     if rng.random() < 0.3:
         island = place.on_floor(find("island"), angle=float(rng.choice([0, 90])), margin=0.5)
         if island is not None:
@@ -287,6 +301,8 @@ def _dining_group(room: Builder, middle: tuple[float, float] | None) -> None:
         return
     chairs = find("chair")
     chair = [chairs[int(rng.integers(len(chairs)))]] if chairs else []
+    # Seats are (sideways, forward, turn) from the table's middle and angle: the two long sides, two
+    # seats each at a long table, then the two ends.
     width, depth, _ = table.model.entry.size_m
     seats = [(0.0, depth / 2, 180.0), (0.0, -depth / 2, 0.0)]
     if width > 1.2:
@@ -295,6 +311,8 @@ def _dining_group(room: Builder, middle: tuple[float, float] | None) -> None:
     for sideways, forward, turn in seats:
         if rng.random() < 0.2:
             continue
+        # The chair's middle is farther out than the table's edge: forward at a long side, sideways
+        # at an end.
         out = 0.22 + abs(rng.normal(0, 0.12))
         away = (
             sideways + (math.copysign(out, sideways) if forward == 0 else 0),
@@ -311,6 +329,7 @@ def _dining_group(room: Builder, middle: tuple[float, float] | None) -> None:
                 place.put(thing)
                 if rng.random() < 0.06:
                     place.on_top(thing, find("sitting_person"), 1, at=(0.0, 0.05))
+                # A plate and a cup on the table's edge before the chair.
                 if rng.random() < 0.7:
                     inner = (
                         sideways - (math.copysign(0.25, sideways) if forward == 0 else 0),
@@ -428,7 +447,8 @@ def _everywhere(room: Builder) -> None:
             place.at_wall(find("bookcase"))
         for _ in range(int(rng.integers(0, 2))):
             place.at_wall(find("sideboard"))
-        place.at_wall(find("radiator")) if rng.random() < 0.3 else None
+        if rng.random() < 0.3:
+            place.at_wall(find("radiator"))
     for _ in range(int(rng.choice([0, 1, 2, 4]))):
         place.in_corner(find("floor_plant"))
     if rng.random() < 0.3:
@@ -449,6 +469,7 @@ def _everywhere(room: Builder) -> None:
 
 def _opposite(angle: float) -> WallName:
     """The wall at which a thing at this angle looks."""
+    # At 0° it looks at the front wall, at −90° (its back to the right wall) at the left one.
     names: tuple[WallName, ...] = ("front", "left", "back", "right")
     return names[round(-angle / 90) % 4]
 
@@ -461,7 +482,7 @@ def _rug(room: Builder, middle: tuple[float, float], angle: float) -> None:
     place = room.place
     wide = rng.uniform(1.2, 2.6)
     deep = wide * rng.uniform(0.55, 0.8)
-    if round(angle / 90) % 2:
+    if round(angle / 90) % 2:  # turned by a quarter
         wide, deep = deep, wide
     x0 = max(0.05, middle[0] - wide / 2)
     y0 = max(0.05, middle[1] - deep / 2)
@@ -539,16 +560,18 @@ def _build_shell(room: Builder) -> None:
     accent = (
         room.surface("plaster", "wallpaper", "brick", "concrete") if rng.random() < 0.35 else wall
     )
-    width, depth, height = place.width, place.depth, place.height
+    width = place.width
+    depth = place.depth
+    height = place.height
 
-    turned = rng.random() < 0.5
-    sides = ((width, 0, 0), (0, depth, 0))
-    if turned:
-        floor_mesh = quad(
-            (width, 0, 0), sides[1], (-width, 0, 0), material_of(floor), (floor.tile_m,) * 2
-        )
+    # The floor's texture runs along the room or across it.
+    floor_tile = (floor.tile_m, floor.tile_m)
+    along_x = (width, 0, 0)
+    along_y = (0, depth, 0)
+    if rng.random() < 0.5:
+        floor_mesh = quad((width, 0, 0), along_y, (-width, 0, 0), material_of(floor), floor_tile)
     else:
-        floor_mesh = quad((0, 0, 0), *sides, material_of(floor), (floor.tile_m,) * 2)
+        floor_mesh = quad((0, 0, 0), along_x, along_y, material_of(floor), floor_tile)
     room.parts.append(floor_mesh)
     ceiling = (
         Material((0.95, 0.95, 0.94))
@@ -558,12 +581,14 @@ def _build_shell(room: Builder) -> None:
     room.parts.append(quad((0, depth, height), (width, 0, 0), (0, -depth, 0), ceiling, (1.5, 1.5)))
     _beams(room)
 
+    # Skirting, casings and some window frames have one paint, from white to brown.
     shade = rng.choice([0.93, 0.9, 0.6, 0.3])
     trim = Material(
         (shade, shade * rng.uniform(0.85, 1), shade * rng.uniform(0.7, 1)),
         specular=0.04,
         roughness=0.4,
     )
+    # One wall may look different.
     accent_wall = WALLS[int(rng.integers(4))]
     skirting = rng.uniform(0.05, 0.14)
     rail = room.kind in ("dining", "living", "office") and rng.random() < 0.2
@@ -588,7 +613,10 @@ def _build_shell(room: Builder) -> None:
                 _curtains(room, frame, opening, length)
             else:
                 room.parts += door_way(frame, opening, trim)
-                _behind(room, frame, opening)
+                if opening.kind == "door":
+                    _close_door(room, frame, opening)
+                else:
+                    _build_next_room(room, frame, opening)
 
 
 def _beams(room: Builder) -> None:
@@ -633,27 +661,27 @@ def _curtains(room: Builder, frame: WallFrame, opening: Opening, length: float) 
     )
 
 
-def _behind(room: Builder, frame: WallFrame, opening: Opening) -> None:
-    """A closed door, or what one sees through a passage: a corridor or another room."""
-    rng = room.rng
-    if opening.kind == "door":
-        left = opening.start
-        right = opening.start + opening.width
-        paint = Material(
-            WHITE if rng.random() < 0.5 else (0.5, 0.33, 0.2), specular=0.04, roughness=0.4
-        )
-        room.parts.append(frame.block(left, right, 0.005, opening.top, 0.04, 0.08, paint))
-        for low, high in ((0.15, 0.8), (1.0, opening.top - 0.15)):  # panels
-            for start, end in (
-                (left + 0.1, (left + right) / 2 - 0.04),
-                ((left + right) / 2 + 0.04, right - 0.1),
-            ):
-                room.parts.append(frame.block(start, end, low, high, 0.03, 0.04, paint))
-        knob = Material((0.7, 0.65, 0.5), specular=0.4, roughness=0.25)
-        room.parts.append(frame.block(right - 0.12, right - 0.06, 1.0, 1.03, -0.03, 0.04, knob))
-        return
+def _close_door(room: Builder, frame: WallFrame, opening: Opening) -> None:
+    """A closed door in an opening, with four panels and a handle."""
+    left = opening.start
+    right = opening.start + opening.width
+    middle = (left + right) / 2
+    color = WHITE if room.rng.random() < 0.5 else (0.5, 0.33, 0.2)
+    paint = Material(color, specular=0.04, roughness=0.4)
+    room.parts.append(frame.block(left, right, 0.005, opening.top, 0.04, 0.08, paint))
+    for low, high in ((0.15, 0.8), (1.0, opening.top - 0.15)):
+        for start, end in ((left + 0.1, middle - 0.04), (middle + 0.04, right - 0.1)):
+            room.parts.append(frame.block(start, end, low, high, 0.03, 0.04, paint))
+    knob = Material((0.7, 0.65, 0.5), specular=0.4, roughness=0.25)
+    room.parts.append(frame.block(right - 0.12, right - 0.06, 1.0, 1.03, -0.03, 0.04, knob))
 
-    # The next room: a box behind the wall, with a lamp of its own and some furniture.
+
+def _build_next_room(room: Builder, frame: WallFrame, opening: Opening) -> None:
+    """What one sees through a passage: a corridor or another room.
+
+    It is a box behind the wall, with a lamp of its own and some furniture.
+    """
+    rng = room.rng
     reach = rng.uniform(1.2, 4.0)
     left = opening.start - rng.uniform(0.1, 1.5)
     right = opening.start + opening.width + rng.uniform(0.1, 1.5)
@@ -663,6 +691,8 @@ def _behind(room: Builder, frame: WallFrame, opening: Opening) -> None:
     height = room.place.height
     inner = WALL_M
     outer = WALL_M + reach
+    # The wall opposite, the walls at both sides, floor and ceiling; then the back of the wall with
+    # the passage, left of it, right of it and above.
     parts = [
         frame.block(left, right, 0, height, outer, outer + 0.01, skin, wall.tile_m),
         frame.block(left - 0.01, left, 0, height, inner, outer, skin, wall.tile_m),
@@ -684,9 +714,12 @@ def _behind(room: Builder, frame: WallFrame, opening: Opening) -> None:
         ),
     ]
     room.parts += parts
+
     middle = frame.point((left + right) / 2, height - 0.35, inner + reach / 2)
     glow = np.array([1.0, 0.9, 0.75]) * rng.uniform(0.3, 2.0)
     room.lamps.append(((middle[0], middle[1], middle[2]), 0.12, glow))
+
+    # Furniture at the wall opposite, which looks towards the passage.
     groups = (
         "sideboard",
         "floor_plant",
@@ -724,6 +757,8 @@ def _hang_pictures(room: Builder) -> None:
         if high > 1.2 or wide > place.length(wall) - 0.2 or height + high / 2 > place.height - 0.1:
             continue
         middle = rng.uniform(wide / 2 + 0.05, place.length(wall) - wide / 2 - 0.05)
+
+        # Not before or beside windows and doors, nor where something else hangs or stands.
         blocked = any(
             one.wall == wall
             and middle - wide / 2 < one.start + one.width + 0.25
@@ -756,14 +791,16 @@ def _mesh_of(room: Builder, thing: Placed, shines: bool) -> Mesh:
 
 
 def _skinned(room: Builder, thing: Placed, material: Material) -> Material:
-    """The material, or another one if it is an untextured grey."""
+    """The material, or another one if it is an untextured grey, which no one chose."""
     rng = room.rng
+    # Textures, glass and metal stay.
     if material.texture is not None or material.opacity < 0.6 or material.specular > 0.3:
         return material
     high = max(material.color)
     low = min(material.color)
     if high - low > NEUTRAL_SATURATION or high < 0.25 or rng.random() > SKIN_SHARE:
         return _toned(rng, material)
+    # Small things get any colour, soft ones cloth, others wood.
     size = max(thing.model.entry.size_m)
     if size < 0.4:
         hue = np.clip(rng.random(3) * rng.uniform(0.3, 1.0) + 0.1, 0.05, 0.92)
@@ -801,17 +838,19 @@ def _with_box_uv(mesh: Mesh, thing: Placed, room: Builder) -> Mesh:
     Each triangle is seen along the axis it faces most.
     """
     folder = str(room.cache)
-    tiles = np.array(
+    is_made = np.array(
         [
-            1.0 if m.texture is not None and m.texture.startswith(folder) else 0.0
-            for m in mesh.materials
-        ]
+            material.texture is not None and material.texture.startswith(folder)
+            for material in mesh.materials
+        ],
+        bool,
     )
-    chosen = tiles[mesh.material] > 0
+    chosen = is_made[mesh.material]  # [F]
     if not chosen.any():
         return mesh
-    normals = np.abs(mesh.normals[chosen].mean(1))
-    axis = normals.argmax(1)
+
+    # The coordinates along the two other axes become u and v.
+    axis = np.abs(mesh.normals[chosen].mean(1)).argmax(1)
     corners = mesh.corners[chosen] * thing.scale / 0.6  # a repeat of 60 cm, as cloth and wood have
     first = np.where(axis == 0, 1, 0)
     second = np.where(axis == 2, 1, 2)
@@ -838,7 +877,7 @@ def _light(room: Builder) -> Lights:
     if windows and rng.random() < 0.65:
         # The sun shines into a window, more or less along its axis.
         frame = WallFrame(place, windows[0].wall)
-        azimuth = math.atan2(frame.out[1], frame.out[0]) + rng.normal(0, 0.6)
+        azimuth = math.atan2(frame.out[1], frame.out[0]) + rng.normal(0, 0.6)  # radians
     elevation = math.radians(rng.uniform(12, 60))
     sun = np.array(
         [
@@ -848,14 +887,18 @@ def _light(room: Builder) -> Lights:
         ],
         np.float32,
     )
+    # A photo stands at the horizon of most skies, if there are photos.
     backdrop = room.photo(rng) if room.photo is not None and rng.random() < 0.8 else None
     sky = made_sky(rng, sun, backdrop)
+    # Irradiance of the sun, in units in which a white sky gives π; 0: behind clouds.
     warm = np.array([1.0, 0.9, 0.75]) ** rng.uniform(0.3, 2.0)
     strength = 0.0 if rng.random() < 0.4 else rng.uniform(4, 16)
     brightness = rng.uniform(0.7, 1.5)
     if evening:
         brightness = rng.uniform(0.005, 0.08)
         strength = 0.0
+
+    # Windows, through which the sky's light comes, lie a little outside of the wall's inner side.
     portals = []
     for opening in windows:
         frame = WallFrame(place, opening.wall)

@@ -70,6 +70,9 @@ def _surfaces(folder: Path, kind: str) -> list[Surface]:
     return found
 
 
+# A surface's picture (None if it is not wanted, because its file is there), the width of one
+# repeat in metres, its specular share and its roughness. These three are drawn first, so that they
+# are the same with and without the picture.
 Drawn = tuple[Image3 | None, float, float, float]
 
 
@@ -91,12 +94,17 @@ def _pick(rng: Rng, colors: tuple[tuple[float, float, float], ...]) -> NDArray[n
 
 
 def _grain(rng: Rng, stretch: int = 24) -> NDArray[np.float64]:
-    """[S, S] wood grain along x."""
+    """[S, S] wood grain along x, around 0.
+
+    Noise is stretched along x by repeating each value `stretch` times, and blurred over the steps
+    that this leaves. Waves of it look like the rings of a tree.
+    """
     fibres = cloud_noise(rng, (SIDE, SIDE), 4, 7)
     column = cloud_noise(rng, (SIDE, SIDE // stretch), 4, 5)
     column = np.repeat(column, stretch, 1)
     column = np.pad(column, ((0, 0), (0, SIDE - column.shape[1])), mode="wrap")
     kernel = np.ones(stretch) / stretch
+    # Three repeats side by side, of which the middle one is kept: the texture has no seam.
     blurred = np.apply_along_axis(
         lambda row: np.convolve(np.tile(row, 3), kernel, "same")[SIDE : 2 * SIDE], 1, column
     )
@@ -114,15 +122,20 @@ def planks(rng: Rng, wanted: bool) -> Drawn:
         return None, boards * width_m, specular, roughness
     color = _pick(rng, WOODS)
     x, y = _grid()
+
+    # [S, S] the board that a pixel lies in, and the piece of this board; joints are shifted from
+    # board to board.
     row = np.minimum((y * boards).astype(int), boards - 1)
     shift = rng.random(boards)[row]
     pieces = int(rng.integers(1, 4))
     piece = ((x + shift) * pieces % pieces).astype(int)
     shade = 1 + rng.normal(0, rng.uniform(0.03, 0.12), (boards, pieces))[row, piece]
+    # Each piece has a shade, and grain from another place.
     grain = _grain(rng)
     moved = (np.arange(SIDE)[None] + (rng.integers(0, SIDE, (boards, pieces))[row, piece])) % SIDE
     grain = grain[np.arange(SIDE)[:, None], moved]
     picture = _colored(shade * (1 + rng.uniform(0.03, 0.1) * grain), color)
+    # Dark gaps between boards and pieces.
     within = y * boards % 1
     along = (x + shift) * pieces % 1
     gap = (np.minimum(within, 1 - within) < 0.012) | (
@@ -144,6 +157,7 @@ def parquet(rng: Rng, wanted: bool) -> Drawn:
     column = (x * blocks).astype(int)
     row = (y * blocks).astype(int)
     upright = (column + row) % 2 == 0
+    # Each square has strips, which run up in every other square.
     across = np.where(upright, x * blocks % 1, y * blocks % 1)
     strip = np.minimum((across * strips).astype(int), strips - 1)
     shade = 1 + rng.normal(0, 0.09, (blocks, blocks, strips))[row, column, strip]
@@ -211,7 +225,7 @@ def wall_tiles(rng: Rng, wanted: bool) -> Drawn:
 def _hue(rng: Rng, saturation: float, value: float) -> NDArray[np.float64]:
     """[3] a colour of random hue."""
     phase = rng.random() * 2 * np.pi
-    wave = 0.5 + 0.5 * np.cos(phase - np.array([0, 2.09, 4.19]))
+    wave = 0.5 + 0.5 * np.cos(phase - np.array([0, 2.09, 4.19]))  # thirds of a circle
     return np.asarray(value * (1 - saturation + saturation * wave))
 
 
@@ -239,6 +253,7 @@ def wallpaper(rng: Rng, wanted: bool) -> Drawn:
     ink = np.clip(ground + rng.choice([-1, 1]) * rng.uniform(0.04, 0.2), 0.05, 0.97) * _hue(
         rng, rng.uniform(0, 0.25), 1.0
     )
+    # Place within a repeat, from its middle, in −0.5..0.5.
     x, y = _grid()
     a = x * repeats % 1 - 0.5
     b = y * repeats % 1 - 0.5
@@ -283,6 +298,7 @@ def rug(rng: Rng, wanted: bool) -> Drawn:
     a = np.abs(2 * x - 1)
     b = np.abs(2 * y - 1)
     edge = 1 - np.maximum(a, b)
+    # A quarter of noise, mirrored to all four, in four colours.
     half = SIDE // 2
     noise = cloud_noise(rng, (SIDE, SIDE), int(rng.integers(3, 12)), 3)[:half, :half]
     noise = np.concatenate([noise, noise[:, ::-1]], 1)

@@ -78,9 +78,10 @@ def choose_viewpoint(
 
 def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpoint:
     """A camera at some height, held a little crooked, that looks at a thing or across the room."""
-    # 24 to 70 mm; phones have 24 to 28 mm.
+    # 24 to 70 mm; phones have 24 to 28 mm. The exponent makes short ones more frequent.
     focal_mm = 24 * (70 / 24) ** (rng.random() ** 1.6)
     camera = Camera.from_focal(focal_mm_to_px(focal_mm, width, height), width, height)
+    # Standing, sitting, or close to the floor.
     eye_height = float(
         rng.choice(
             [rng.uniform(1.3, 1.7), rng.uniform(0.8, 1.3), rng.uniform(0.35, 0.8)],
@@ -101,9 +102,11 @@ def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpo
     if place.things and rng.random() < 0.75:
         box = place.things[int(rng.integers(len(place.things)))].box
         target = np.array([(box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2, (box.z0 + box.z1) / 2])
+        # People look less far up or down than at the thing's own middle.
         target[2] = 0.5 * target[2] + 0.5 * (eye[2] - 0.25)
     target = target + rng.normal(0, 0.25, 3)
     forward = target - eye
+    # Angles in radians; nobody looks steeply up or down.
     flat = max(float(np.hypot(forward[0], forward[1])), 0.3)
     pitch = np.clip(math.atan2(forward[2], flat), -0.6, 0.2)
     azimuth = math.atan2(forward[1], forward[0])
@@ -120,8 +123,11 @@ def _axes(azimuth: float, pitch: float, roll: float) -> Floats:
     )
     right = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     down = np.cross(forward, right)
-    c, s = math.cos(roll), math.sin(roll)
-    return np.stack([c * right + s * down, c * down - s * right, forward]).astype(np.float32)
+    cosine = math.cos(roll)
+    sine = math.sin(roll)
+    rolled_right = cosine * right + sine * down
+    rolled_down = cosine * down - sine * right
+    return np.stack([rolled_right, rolled_down, forward]).astype(np.float32)
 
 
 def _score(world: World, viewpoint: Viewpoint) -> float:
@@ -135,9 +141,11 @@ def _score(world: World, viewpoint: Viewpoint) -> float:
         return -1.0
     if np.quantile(depth, 0.3) < 0.7:  # something fills the picture
         return -0.5
+    # Many materials (the entropy of their shares of the picture), near and far things, and not
+    # too much sky.
     materials = world.mesh.material[hits.triangle[hits.triangle >= 0]]
-    kinds = np.bincount(materials)
-    shares = kinds[kinds > 0] / len(materials)
+    counts = np.bincount(materials)
+    shares = counts[counts > 0] / len(materials)
     variety = float(-(shares * np.log(shares)).sum())
     spread = float(np.log(depth).std())
     openness = 1 - len(depth) / (rows * columns)
@@ -155,6 +163,7 @@ def second_cameras(
         viewpoint: the photo's.
         depth: [N] known depths of the photo.
     """
+    # The quantiles and the least focus that `spackle predict` uses.
     near, focus = np.quantile(depth, [0.001, 0.1])
     depth_range = DepthRange(near=float(near), focus=max(2.0, float(focus)))
     cameras: list[Camera] = []
@@ -188,6 +197,7 @@ def _is_free(world: World, viewpoint: Viewpoint, camera: Camera) -> bool:
     direction = (step / length)[None].astype(np.float32)
     if world.blocked(origin, direction, np.array([length + 0.1], np.float32))[0]:
         return False
+    # A few rays of the camera tell whether something stands close in front of it.
     small = camera.resized(12, 9)
     origins, directions = viewpoint.rays(small, pixel_grid(9, 12))
     hits = world.first_hits(origins, directions)

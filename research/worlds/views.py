@@ -27,7 +27,10 @@ COARSE_M = 0.22  # width of coarse cells of light in rooms
 SHINY = 0.35  # surfaces rougher than this show no reflections
 GLASS_SHINE = 0.1  # share of light that panes reflect; it comes from the room's mean
 MAX_RADIANCE = 12.0  # brighter rays would make edges hard again
-VALID, FAR, UNSURE = 1, 2, 0  # values of the validity mask
+# Values of the validity mask.
+UNSURE = 0  # seen through glass
+VALID = 1  # a surface
+FAR = 2  # the sky
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,15 +46,15 @@ class View:
 
 @dataclasses.dataclass
 class _Traced:
-    """The rays through the middles of a view's pixels."""
+    """Rays of a camera, and the surfaces where they end."""
 
     camera: Camera
-    origins: Floats
-    directions: Floats
+    origins: Floats  # [N, 3]
+    directions: Floats  # [N, 3] of depth 1
     hits: Hits
-    smooth: Floats
-    flat: Floats
-    positions: Floats
+    smooth: Floats  # [N, 3] unit normals for shading, 0 for the sky
+    flat: Floats  # [N, 3] unit normals of the triangles, 0 for the sky
+    positions: Floats  # [N, 3] where they end; for the sky the origin
 
 
 def render(
@@ -66,6 +69,7 @@ def render(
         cameras: the views' cameras, in the photo's coordinates.
     """
     traced = [_trace(world, viewpoint, camera) for camera in cameras]
+    # The light is found once, on all surfaces that any view sees.
     met = [one.hits.triangle >= 0 for one in traced]
     focal_px = viewpoint.camera.focal[0]
     irradiance = solve(
@@ -104,11 +108,21 @@ def _finished(
     viewpoint: Viewpoint,
     middle: _Traced,
 ) -> View:
-    """A view with smooth edges."""
+    """A view with smooth edges.
+
+    Args:
+        rng: places of the further rays in the pixels at edges.
+        world, lights, irradiance: the world and its light.
+        viewpoint: the photo's camera.
+        middle: the rays through the middles of the view's pixels.
+    """
     camera = middle.camera
     shape = (camera.height, camera.width)
     suns = _points_of_sun(lights)
     colors, sunlit = _shaded(world, lights, irradiance, camera, middle, suns[0])
+
+    # Pixels at edges become the mean of several rays. Very bright ones are limited, because a
+    # single one would decide the mean.
     edges = _edges(middle, sunlit, shape).reshape(-1)
     chosen = np.flatnonzero(edges)
     if len(chosen):
@@ -124,6 +138,7 @@ def _finished(
             total += np.minimum(extra, MAX_RADIANCE)
         colors[chosen] = total / (EDGE_RAYS + 1)
 
+    # Normals in this camera's axes.
     found = middle.hits.triangle >= 0
     rotation = camera.world_to_camera[:3, :3].numpy() @ viewpoint.axes
     normal = (middle.smooth @ rotation.T).astype(np.float32)
@@ -141,9 +156,12 @@ def _finished(
 
 def _points_of_sun(lights: Lights) -> Floats:
     """[1 + EDGE_RAYS, 3] unit directions to the middle of the sun and around it."""
+    # Two directions at right angles to the sun's.
     across = np.cross(lights.sun_direction, [0.0, 0.0, 1.0])
     across = across / max(float(np.linalg.norm(across)), 1e-6)
     upwards = np.cross(across, lights.sun_direction)
+    # Points on a circle of 0.7 of the sun's radius, which halves its disc. The turn of 0.4 steps
+    # keeps them off the vertical and the horizontal.
     angles = 2 * np.pi * (np.arange(EDGE_RAYS) + 0.4) / EDGE_RAYS
     around = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * upwards
     points = lights.sun_direction + 0.7 * lights.sun_spread * np.concatenate(
@@ -153,7 +171,13 @@ def _points_of_sun(lights: Lights) -> Floats:
 
 
 def _edges(middle: _Traced, sunlit: Floats, shape: tuple[int, int]) -> Bools:
-    """[H, W] pixels with another surface or other sunlight beside them."""
+    """[H, W] pixels with another surface or other sunlight beside them.
+
+    Args:
+        middle: the rays through the middles of all pixels.
+        sunlit: [H · W] cosine towards the sun, 0 in shadow.
+        shape: height and width.
+    """
     triangle = middle.hits.triangle.reshape(shape)
     depth = np.where(triangle >= 0, middle.hits.distance.reshape(shape), 1e6)
     normal = middle.flat.reshape(*shape, 3)
@@ -161,16 +185,18 @@ def _edges(middle: _Traced, sunlit: Floats, shape: tuple[int, int]) -> Bools:
     lit = sunlit.reshape(shape) > 0
     glass = middle.hits.passed.reshape(shape)
     edges = np.zeros(shape, bool)
+    # Each pixel is compared with the one below it, then with the one to its right.
     for axis in (0, 1):
         one = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
         other = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
+        # Another surface: turned another way, or away from the plane of this one.
         turned = (normal[one] * normal[other]).sum(-1) < EDGE_COSINE
         apart = np.abs(((position[one] - position[other]) * normal[one]).sum(-1))
         away = apart > EDGE_RATIO * np.minimum(depth[one], depth[other])
         differs = (triangle[one] < 0) != (triangle[other] < 0)
         both_sky = (triangle[one] < 0) & (triangle[other] < 0)
         shade = lit[one] != lit[other]
-        pane = glass[one] != glass[other]
+        pane = glass[one] != glass[other]  # the border of a pane
         edge = ((turned | away) & ~both_sky) | differs | shade | pane
         edges[one] |= edge
         edges[other] |= edge
@@ -203,13 +229,7 @@ def _shaded(
     open_sky = np.flatnonzero(hits.triangle < 0)
     colors[open_sky] = lights.sky_smooth(unit[open_sky])
     if len(found):
-        part = Hits(
-            hits.triangle[found],
-            hits.distance[found],
-            hits.u[found],
-            hits.v[found],
-            hits.passed[found],
-        )
+        part = hits.select(found)
         normals = traced.smooth[found]
         positions = traced.positions[found]
         towards = -unit[found]
@@ -224,6 +244,7 @@ def _shaded(
             seen = sun_on(world, sun_direction, positions + NUDGE_M * flat, normals)
             sunlit[found] = seen
             light = light + seen[:, None] * lights.sun_color
+        # A matt surface reflects its irradiance / π in all directions; lamps shine besides.
         material = world.mesh.material[part.triangle]
         glow = world.emission[material][:, None] * world.color[material]
         shaded = albedo * light / np.pi + glow
@@ -247,7 +268,15 @@ def _with_reflections(
     towards: Floats,
     material: NDArray[np.int32],
 ) -> Floats:
-    """Colours with what shiny surfaces mirror."""
+    """Colours [N, 3] with what shiny surfaces mirror.
+
+    Args:
+        world, lights, irradiance: the world and its light.
+        colors: [N, 3] linear, without reflections.
+        positions, normals: [N, 3] the points, and their unit normals.
+        towards: [N, 3] unit vectors to the eye.
+        material: [N] of the points.
+    """
     specular = world.specular[material]
     roughness = world.roughness[material]
     shiny = np.flatnonzero((specular > 0.01) & (roughness < SHINY))
@@ -261,6 +290,7 @@ def _with_reflections(
     cosine = (n * v).sum(1, keepdims=True)
     direction = (2 * cosine * n - v).astype(np.float32)
     above = (direction * n).sum(1) > 0.01
+    # Schlick's approximation of Fresnel's formula: at a grazing angle everything is mirrored.
     share = specular[shiny] + (1 - specular[shiny]) * np.clip(1 - cosine[:, 0], 0, 1) ** 5
     # Rough surfaces scatter most of it, and fade out at the limit.
     share = share * (1 - blur / SHINY)
@@ -269,21 +299,17 @@ def _with_reflections(
     seen = np.flatnonzero((mirrored.triangle >= 0) & above)
     light = np.zeros((len(shiny), 3), np.float32)
     if len(seen):
-        part = Hits(
-            mirrored.triangle[seen],
-            mirrored.distance[seen],
-            mirrored.u[seen],
-            mirrored.v[seen],
-            mirrored.passed[seen],
-        )
+        part = mirrored.select(seen)
         where = (origins[seen] + part.distance[:, None] * direction[seen]).astype(np.float32)
         side, _ = world.normals(part, direction[seen])
-        width = 0.005 + (0.002 + 0.6 * blur[seen]) * part.distance
+        # A rough surface blurs what it mirrors, the more the farther away that is.
+        width = 0.005 + (0.002 + 0.6 * blur[seen]) * part.distance  # metres
         own = world.albedo(part, width.astype(np.float32))
         number = world.mesh.material[part.triangle]
         glow = world.emission[number][:, None] * world.color[number]
         light[seen] = own * irradiance.roughly_at(where, side) / np.pi + glow
     sky = np.flatnonzero((mirrored.triangle < 0) & above)
+    # The glow around the sun is limited: it would make single pixels sparkle.
     light[sky] = np.minimum(lights.sky_smooth(direction[sky]), 3.0)
     result = colors.copy()
     weight = share[:, None]
