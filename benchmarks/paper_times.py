@@ -33,6 +33,7 @@ from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
+from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo, working_size
 from spackle.paper.evaluation.bench import (
     COMPLETION_STAGES,
@@ -44,7 +45,7 @@ from spackle.paper.evaluation.bench import (
     time_tasks,
 )
 from spackle.paper.evaluation.options import LARGE_VIEW_SIDE_PX
-from spackle.render import get_renderer
+from spackle.render import Renderer, get_renderer
 from spackle.residual import MIN_AUX_GAUSSIANS, ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual, open_residual, shipped_network
 from spackle.residual.network import predict_deltas
@@ -100,7 +101,39 @@ def open_networks(files: list[Path], device: torch.device) -> dict[str, Residual
     return {network.name: network for network in laid_out}
 
 
+def find_views(scene: Gaussians, photo_camera: Camera, renderer: Renderer) -> list[View]:
+    """The views of a scene with the shares of holes `HOLE_RATIOS`, of the size of large views."""
+    view_size = working_size(*PHOTO_SIZE, LARGE_VIEW_SIDE_PX)
+    view_camera = photo_camera.resized(*view_size)
+    views = []
+    for hole_ratio in HOLE_RATIOS:
+        disparity, camera = find_view(scene, view_camera, renderer, hole_ratio)
+        found = hole_area_ratio(renderer.render(scene, camera).alpha)
+        views.append(View(found, disparity, camera))
+    return views
+
+
+def with_cpu_clock(
+    name: str, task: TimedTask, cpu_seconds: dict[str, list[float]], end_stage: EndStage
+) -> None:
+    """Run a task, and add the CPU seconds of its stages to `cpu_seconds`, by "name/stage"."""
+    last = time.process_time()
+
+    def end_stage_of_both(stage: str) -> None:
+        """Stop the times of a stage: the caller's, and the CPU's."""
+        nonlocal last
+        end_stage(stage)
+        now = time.process_time()
+        cpu_seconds.setdefault(f"{name}/{stage}", []).append(now - last)
+        last = now
+
+    start = time.perf_counter()
+    task(end_stage_of_both)
+    print(f"{name}: {time.perf_counter() - start:.1f} s", flush=True)
+
+
 def main(arguments: list[str]) -> None:
+    """Time everything, and write the results after each turn of all tasks."""
     options = parse(arguments)
     device = torch.device(options.device)
     make_folder(options.output)
@@ -116,13 +149,7 @@ def main(arguments: list[str]) -> None:
     renderer = get_renderer(device.type)
     scene, photo_camera = holed_scene(width, height)
     scene = scene.to(device)
-    view_size = working_size(width, height, LARGE_VIEW_SIDE_PX)
-    view_camera = photo_camera.resized(*view_size)
-    views = []
-    for hole_ratio in HOLE_RATIOS:
-        disparity, camera = find_view(scene, view_camera, renderer, hole_ratio)
-        found = hole_area_ratio(renderer.render(scene, camera).alpha)
-        views.append(View(found, disparity, camera))
+    views = find_views(scene, photo_camera, renderer)
     print(f"views: {[(round(v.hole_ratio, 4), round(v.disparity, 3)) for v in views]}", flush=True)
 
     networks = open_networks(options.residual, device)
@@ -148,22 +175,7 @@ def main(arguments: list[str]) -> None:
         aux = complete_view_in_stages(contexts[network], view.camera, end_stage, "paper")
         added_counts[name] = len(aux)
 
-    def with_cpu_clock(name: str, task: TimedTask, end_stage: EndStage) -> None:
-        """The task; its CPU seconds are noted by stage."""
-        last = time.process_time()
-
-        def end_stage_of_both(stage: str) -> None:
-            """Stop the times of a stage."""
-            nonlocal last
-            end_stage(stage)
-            now = time.process_time()
-            cpu_seconds.setdefault(f"{name}/{stage}", []).append(now - last)
-            last = now
-
-        start = time.perf_counter()
-        task(end_stage_of_both)
-        print(f"{name}: {time.perf_counter() - start:.1f} s", flush=True)
-
+    # The base, and each network at each share of holes.
     tasks: dict[str, TimedTask] = {BASE: predict_and_render}
     cases: dict[str, tuple[str, View]] = {}
     for view in views:
@@ -171,8 +183,12 @@ def main(arguments: list[str]) -> None:
             name = f"{network}, HAR {view.hole_ratio:.1%}"
             cases[name] = (network, view)
             tasks[name] = functools.partial(complete, network, view, name)
-    tasks = {name: functools.partial(with_cpu_clock, name, task) for name, task in tasks.items()}
+    tasks = {
+        name: functools.partial(with_cpu_clock, name, task, cpu_seconds)
+        for name, task in tasks.items()
+    }
 
+    # Operations and steps are counted once, the times of all tasks in each turn.
     print("operations", flush=True)
     flops = {
         network: count_flops(lambda context=context: run_network(context, views[1].camera))  # type: ignore[misc]
@@ -193,7 +209,7 @@ def main(arguments: list[str]) -> None:
         "commit": commit(),
         "precision": dtype,
         "gaussians": len(scene),
-        "view": view_size,
+        "view": (views[0].camera.width, views[0].camera.height),
         "load_before": load_before,
         "flops": flops,
         "profiles_ms": profiles,

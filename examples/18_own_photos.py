@@ -2,8 +2,8 @@
 
 python examples/18_own_photos.py left.png right.png 995 0.193 2 10 results
 
-The numbers are the focal length in pixels, the distance of the two cameras, and the nearest and
-the farthest depth, all three in metres. Instead of two depths, a scene.json may name a disparity
+The numbers are the focal length in pixels; then, in metres, the distance of the two cameras, the
+nearest and the farthest depth. Instead of two depths, a scene.json may name a disparity
 map or depth maps, which "rgbd" as the base needs. The guide on evaluation lists all keys.
 """
 

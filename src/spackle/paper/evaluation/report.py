@@ -221,6 +221,49 @@ def overview_table(runs: Sequence[Run]) -> Table:
     Columns are the holes that remain at each size of the camera move, and the metrics against true
     second photos; columns without numbers are left out.
     """
+    columns = _overview_columns(runs)
+
+    # Evaluations of large views and of near views with one base share their rows.
+    runs_by_group: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        runs_by_group.setdefault((run.title, run.base_title), []).append(run)
+
+    groups = []
+    for (title, base), group_runs in runs_by_group.items():
+        methods = list(dict.fromkeys(method for run in group_runs for method in run.methods))
+        measurements = [measurement for run in group_runs for measurement in run.measurements]
+        rows = texts_of_methods(measurements, columns, methods)
+        names = [picture_title(group_runs[0], method) for method in methods]
+        groups.append((f"{title}, base {base}", names, rows))
+
+    # Only columns in which any row has a number.
+    shown_indices = [
+        index
+        for index in range(len(columns))
+        if any(texts[index] for _, _, rows in groups for texts in rows)
+    ]
+    bodies = []
+    for group_title, names, rows in groups:
+        row_texts = [
+            (name, *(texts[index] for index in shown_indices))
+            for name, texts in zip(names, rows, strict=True)
+        ]
+        bodies.append(prepend_group_name(group_title, row_texts))
+    # The first two columns, of the group and of the method, need no heads.
+    shown_heads = [(columns[index].group, columns[index].title) for index in shown_indices]
+    return Table(
+        label="",
+        title="",
+        caption="",
+        heads=[("", ""), ("", ""), *shown_heads],
+        bodies=bodies,
+        word_columns=2,
+        notes=overview_notes(runs),
+    )
+
+
+def _overview_columns(runs: Sequence[Run]) -> list[Column]:
+    """The columns of an overview: holes at each size of the camera move, then image metrics."""
     settings = dict.fromkeys(
         setting for run in runs if not run.compares_with_photos for setting in run.settings
     )
@@ -244,43 +287,9 @@ def overview_table(runs: Sequence[Run]) -> Table:
             lower_is_better=not column.title.endswith("↑"),
         )
         for metric, column in MEANS_COLUMNS.items()
-        if metric not in ("har", "aux")
+        if metric not in ("har", "aux")  # no metrics of images
     ]
-
-    # Evaluations of large views and of near views with one base share their rows.
-    runs_by_group: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        runs_by_group.setdefault((run.title, run.base_title), []).append(run)
-
-    groups = []
-    for (title, base), group_runs in runs_by_group.items():
-        methods = list(dict.fromkeys(method for run in group_runs for method in run.methods))
-        measurements = [measurement for run in group_runs for measurement in run.measurements]
-        rows = texts_of_methods(measurements, columns, methods)
-        names = [picture_title(group_runs[0], method) for method in methods]
-        groups.append((f"{title}, base {base}", names, rows))
-
-    shown = [
-        index
-        for index in range(len(columns))
-        if any(texts[index] for _, _, rows in groups for texts in rows)
-    ]
-    bodies = []
-    for group_title, names, rows in groups:
-        row_texts = [
-            (name, *(texts[index] for index in shown))
-            for name, texts in zip(names, rows, strict=True)
-        ]
-        bodies.append(prepend_group_name(group_title, row_texts))
-    return Table(
-        label="",
-        title="",
-        caption="",
-        heads=[("", ""), ("", ""), *((columns[i].group, columns[i].title) for i in shown)],
-        bodies=bodies,
-        word_columns=2,
-        notes=overview_notes(runs),
-    )
+    return columns
 
 
 def means_table(run: Run, measurements: Iterable[Measurement]) -> Table:

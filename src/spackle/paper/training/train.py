@@ -148,19 +148,13 @@ def run_steps(run: TrainingRun, logger: Logger | None = None) -> str:
         step, items = step_and_items
         return run.task.load_batch(step, items)
 
-    # On a CPU the network itself needs the cores, so one thread reads batches. Beside GPUs the
-    # processes divide half of the cores among them for reading.
-    reader_threads = 1
-    if run.device.type != "cpu":
-        reader_threads = max(1, (os.cpu_count() or 1) // (2 * rank_count()))
-
     with contextlib.ExitStack() as stack:
         if rank() == 0:
             run.logs = stack.enter_context(
                 open_logs(run.output, progress.step, run.reporter.log, logger)
             )
         batches = stack.enter_context(
-            contextlib.closing(prefetch(load_pass, passes, reader_threads))
+            contextlib.closing(prefetch(load_pass, passes, reader_thread_count(run.device)))
         )
         show_progress = stack.enter_context(run.reporter.steps("train", progress.step, optim.steps))
         stop_requested = stack.enter_context(catch_stop_signals(single_process=rank_count() == 1))
@@ -192,6 +186,17 @@ def run_steps(run: TrainingRun, logger: Logger | None = None) -> str:
     end_reason = run.end_reason()
     assert end_reason is not None  # the loop ends for a reason
     return end_reason
+
+
+def reader_thread_count(device: torch.device) -> int:
+    """The number of threads that read batches in advance in this process.
+
+    On a CPU the network itself needs the cores, so one thread reads. Beside GPUs the processes
+    divide half of the cores among them for reading.
+    """
+    if device.type == "cpu":
+        return 1
+    return max(1, (os.cpu_count() or 1) // (2 * rank_count()))
 
 
 def train_step(
@@ -324,7 +329,7 @@ def save_if_due(run: TrainingRun) -> None:
     """After a step: let process 0 write the weights and a checkpoint, if it is time.
 
     It is time every `run.save_every` steps of the recipe, and when the run ends. It may end before
-    its last step, because validations have stopped to improve.
+    its last step, because validations no longer improve.
     """
     is_due = run.progress.step % run.recipe.run.save_every == 0 or run.end_reason() is not None
     if rank() != 0 or not is_due:
