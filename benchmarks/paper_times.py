@@ -94,6 +94,7 @@ def open_networks(files: list[Path], device: torch.device) -> dict[str, Residual
     if not networks:
         shipped = shipped_network()
         networks = [shipped or open_residual("unet"), open_residual("sharp-decoder")]
+    # The layout in memory in which convolutions are fastest.
     laid_out = [
         network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         for network in networks
@@ -234,7 +235,13 @@ def run_network(context: FillContext, camera: Camera) -> None:
 
 
 def profile(context: FillContext, view: View, device: torch.device) -> dict[str, float]:
-    """Milliseconds of the steps of the paper's method, in one run after an untimed run."""
+    """Milliseconds of each step of the paper's method: medians of three runs after an untimed one.
+
+    Args:
+        context: the scene and the network.
+        view: the view that is completed.
+        device: where it is done.
+    """
     network = context.network
     assert network is not None
 
@@ -276,7 +283,12 @@ def added_ratios(clock: Mapping[str, list[float]], name: str) -> RunValues:
 
 
 def table(cases: Mapping[str, tuple[str, View]], facts: Mapping[str, Any]) -> str:
-    """The results as Markdown."""
+    """The results as Markdown.
+
+    Args:
+        cases: the network and the view of each task, by its name.
+        facts: what paper_times.json holds.
+    """
     lines = [
         f"{facts['cpu']}, {facts['threads']} threads, {facts['precision']}; {facts['turns']} "
         f"turns; load {facts['load_before']:.1f} to {facts['load']:.1f}; commit {facts['commit']}",

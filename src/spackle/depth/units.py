@@ -88,7 +88,8 @@ def parse_depth_unit(unit: str | float) -> DepthUnit:
     if text == INVERSE_METRES:
         return DepthUnit(1.0, is_inverse=True, name="inverse metres")
 
-    # An optional number or fraction, and an optional name. One of them must be there.
+    # An optional number or fraction, and an optional name. One of them must be there. A number has
+    # digits before or after its point, and may have an exponent, as 1e-3.
     number = r"\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?"
     match = re.fullmatch(rf"(?:({number})(?:/({number}))?)?\s*(km|m|cm|mm)?", text)
     factor = 0.0

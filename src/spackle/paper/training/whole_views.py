@@ -50,7 +50,7 @@ class WholeViews:
         Args:
             files: the dataset.
             photos: the photos' indices in the dataset.
-            network: names its inputs, and thereby the class that computes them.
+            network: the network that is trained; views compute the inputs that it names.
             renderer: renders the base, the photo's Gaussians, from the views.
         """
         self.network = network
