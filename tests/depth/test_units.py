@@ -51,6 +51,10 @@ def write_exr(path: Path, numbers: NDArray[Any]) -> None:
         file.write(str(path))
 
 
+def write_tiff(path: Path, numbers: NDArray[Any]) -> None:
+    pytest.importorskip("tifffile").imwrite(path, numbers, compression="zlib")
+
+
 def write_png(path: Path, numbers: NDArray[Any]) -> None:
     io = pytest.importorskip("skimage.io")
     io.imsave(f"{path}.png", numbers, check_contrast=False)
@@ -78,6 +82,8 @@ ROWS: dict[str, Row] = {
     "`.npy`, `.npz`, metres": (write_npy, lambda z: z, {}, 0),
     "`.pfm`, metres": (write_pfm, lambda z: z, {}, 0),
     "`.exr`, metres": (write_exr, lambda z: z, {}, 0),
+    "`.tif`, metres": (write_tiff, lambda z: z, {}, 0),
+    "16-bit `.tif`, millimetres": (write_tiff, lambda z: whole(1000 * z, ">u2"), {}, 4e-4),
     "16-bit `.png`, millimetres": (write_png, lambda z: whole(1000 * z), {}, 4e-4),
     "KITTI (`.png`, 1/256 m)": (write_png, lambda z: whole(256 * z), {"unit": "1/256"}, 2e-3),
     "TUM RGB-D (`.png`, 1/5000 m)": (
@@ -109,6 +115,12 @@ ROWS: dict[str, Row] = {
     ),
     "Depth Anything `.npy`": (
         write_npy,
+        lambda z: np.where(z > 0, 9 * inverse(z) + 1, np.nan),
+        {"kind": "near-white"},
+        2e-2,
+    ),
+    "Depth Anything `.tif`": (
+        write_tiff,
         lambda z: np.where(z > 0, 9 * inverse(z) + 1, np.nan),
         {"kind": "near-white"},
         2e-2,
@@ -220,11 +232,19 @@ UNCLEAR = [  # numbers that are hardly metres, and a part of the message
     (65535 * SLOPE, "values around 32.* are hardly metres"),
     (2500 + 100 * SLOPE, "values around 25.* are hardly metres"),
     (whole(3000 * SLOPE, np.int32), "integers around 1500 are hardly metres"),
+    (whole(400 * SLOPE, np.uint16), "integers around 200 are hardly metres"),  # a desk in mm
     (whole(255 * SLOPE, np.uint8), "8 bits"),
     (Image.fromarray(whole(255 * SLOPE, np.uint8)), "8 bits"),
     (Image.fromarray(whole(65535 * SLOPE)), "fill the range of 16 bits"),
     (Image.fromarray(whole(255 * SLOPE, np.uint8)).convert("RGB"), "mode RGB"),
 ]
+
+
+def test_a_coloured_picture_is_refused_at_once() -> None:
+    colors = np.stack([whole(255 * SLOPE, np.uint8), whole(99 * SLOPE, np.uint8)] * 2, -1)[..., :3]
+    for kind in ("auto", "near-white"):
+        with pytest.raises(InputError, match="a colour picture does not tell near from far"):
+            load_depth(DepthValue(Image.fromarray(colors)), kind=kind)
 
 
 @pytest.mark.parametrize(("value", "says"), UNCLEAR)
@@ -298,7 +318,8 @@ def test_masked_depth_is_unknown(dtype: Any) -> None:
     depth = truth()
     hidden = depth > 20
     masked = np.ma.masked_array(depth.astype(dtype), hidden)
-    same_depth(load_depth(DepthValue(masked)), np.where(hidden, 0, depth.astype(dtype)))
+    found = load_depth(DepthValue(masked), unit="m")  # integers do not say their unit
+    same_depth(found, np.where(hidden, 0, depth.astype(dtype)))
     # A relative map has numbers everywhere, and so only the mask says what is unknown.
     relative = load_depth(DepthValue(masked), kind="near-black")
     np.testing.assert_array_equal(relative.valid.numpy(), ~hidden)
@@ -341,5 +362,6 @@ def test_sides_that_a_network_rounded_fit(photo: Any, map_size: Any) -> None:
 def test_maps_of_another_shape_are_refused(photo: Any, map_size: Any) -> None:
     width, height = map_size
     found = load_depth(DepthValue(np.ones((height, width), np.float32)))
-    with pytest.raises(InputError, match=f"is {width}×{height} but photo a.jpg is"):
+    with pytest.raises(InputError, match=f"is {width}×{height} but photo a.jpg is") as caught:
         found.check_aspect_ratio(photo[1], photo[0], "a.jpg")
+    assert ("on its side: turn it upright" in str(caught.value)) == (map_size == photo[::-1])

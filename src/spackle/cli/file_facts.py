@@ -42,14 +42,16 @@ def print_facts(path: Path, reporter: Reporter) -> None:
 
 
 def is_depth_map(path: Path) -> bool:
-    """Whether a file is a depth map, by its suffix or, for a PNG, by 16 bits in one channel."""
-    # Photos, too, may be PNG files, so for these the suffix decides nothing.
+    """Whether a file is a depth map, by its suffix or, for a picture, by its kind of numbers."""
+    # Photos, too, may be PNG and TIFF files, so for these the suffix decides nothing.
     suffix = path.suffix.lower()
-    if suffix != ".png":
+    if suffix not in (".png", ".tif", ".tiff"):
         return suffix in DEPTH_SUFFIXES
     try:
-        with open_image(path, ("PNG",)) as image:
-            return image.mode.startswith("I")  # Pillow's modes of whole numbers over 8 bits
+        with open_image(path, ("PNG", "TIFF")) as image:
+            # Pillow's modes: F for floats, I… for whole numbers over 8 bits. A grey TIFF of those
+            # is more often the scan of a photo.
+            return image.mode == "F" or (suffix == ".png" and image.mode.startswith("I"))
     except (OSError, ValueError, SyntaxError, DecompressionBombError):
         return False  # the reader of photos reports the error
 

@@ -85,7 +85,7 @@ DepthUnitOption = Annotated[
         metavar="UNIT",
         help="Unit of --depth: m, cm, mm, km, or a number of metres, such as 1/256 for KITTI; "
         "1/m: inverse depth.",
-        show_default="mm in a PNG, else m",
+        show_default="mm in a PNG or TIFF of 16 bits, else m",
     ),
 ]
 

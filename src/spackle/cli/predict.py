@@ -72,8 +72,8 @@ def predict(
         Path | None,
         typer.Option(
             metavar="PATH_OR_FOLDER",
-            help="Depth of the photo: .npy, .npz, .pfm, .exr (metres), 16-bit .png (mm), a "
-            "Middlebury disparity map, or a grey picture with --depth-kind.",
+            help="Depth of the photo: .npy, .npz, .pfm, .exr, .tif (metres), 16-bit .png, .tif "
+            "(mm), a Middlebury disparity map, or a grey picture with --depth-kind.",
         ),
     ] = None,
     depth_kind: DepthKindOption = "auto",

@@ -74,11 +74,17 @@ class DepthMap:
             return
         rows, columns = self.depth.shape
         is_rounded = is_size_of_network(rows, columns, height, width)
-        if not is_rounded or stretch > MAX_NETWORK_STRETCH:
-            raise InputError(
-                f"depth map {self.path} is {columns}×{rows} but photo {photo} is {width}×{height}: "
-                "give a depth map with the photo's size or aspect ratio"
-            )
+        if is_rounded and stretch <= MAX_NETWORK_STRETCH:
+            return
+        advice = "give a depth map with the photo's size or aspect ratio"
+        # Programs that ignore EXIF's orientation write maps that lie on their side.
+        is_on_its_side = abs(self.stretch_to(width, height)) <= ASPECT_TOLERANCE
+        if is_on_its_side:
+            advice = "it lies on its side: turn it upright, as EXIF turns the photo"
+        raise InputError(
+            f"depth map {self.path} is {columns}×{rows} but photo {photo} is {width}×{height}: "
+            + advice
+        )
 
     def with_focal(self, focal_px: float) -> DepthMap:
         """The map for another focal length, in pixels of the map.

@@ -1,4 +1,4 @@
-"""Read depth maps from files: NumPy, PNG, PFM and EXR, and relative depth from any grey picture.
+"""Read depth maps from files: NumPy, PNG, TIFF, PFM, EXR, and relative depth from grey pictures.
 
 `load_depth` is the entry. The content of a file decides its format (`read_array`); the numbers
 become metres in `units`, or in `calibration` for the disparities of stereo pairs.
@@ -19,6 +19,7 @@ from PIL import Image
 
 from spackle.core.array_values import plain_array, without_unit_axes
 from spackle.core.image_files import check_pixel_count, read_image
+from spackle.core.image_formats import UNKNOWN, kind_of_file
 from spackle.depth.calibration import (
     LARGEST_NUMBER,
     Calibration,
@@ -42,9 +43,10 @@ from spackle.depth.units import (
 from spackle.runtime.errors import InputError, as_input_error, short_repr
 from spackle.runtime.files import check_file
 
-DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm", ".exr")
+DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm", ".exr", ".tif", ".tiff")
 MAX_NPY_HEADER_BYTES = 1 << 16  # a damaged header may announce 4 GB of itself
 MAX_CHANNEL_DIFFERENCE = 8  # of 255: channels of a grey picture differ by less, even from JPEG
+MAX_LISTED_ARRAYS = 4  # of an archive, in a message
 NOT_GREY = "a colour picture does not tell near from far: give a grey one"
 
 NPY_MAGIC = b"\x93NUM"
@@ -52,6 +54,7 @@ ZIP_MAGIC = b"PK\x03\x04"
 PNG_MAGIC = b"\x89PNG"
 PFM_MAGIC = b"Pf"  # a portable float map with one channel
 PFM_COLOUR_MAGIC = b"PF"  # one with three channels
+TIFF_MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # both byte orders, and BigTIFF
 
 
 def find_depth_file(depth: Path, photo: Path) -> Path:
@@ -92,10 +95,10 @@ def load_depth(
 ) -> DepthMap:
     """Read a depth map, a disparity map with its calibration, or a relative map.
 
-    Depth is stored in metres in `.npy`, `.npz` (one array, or the key `depth`), `.pfm` and `.exr`
-    (the channel depth, Z, V, Y or R): 0, NaN and inf mean unknown. A 16-bit `.png` stores
-    millimetres: 0 and 65535 mean unknown. The content decides the format. A `unit` replaces metres
-    and millimetres.
+    Depth is stored in metres in `.npy`, `.npz` (one array, or the key `depth`), `.pfm`, `.exr` (the
+    channel depth, Z, V, Y or R) and `.tif` of floats: 0, NaN and inf mean unknown. A 16-bit `.png`
+    or `.tif` stores millimetres: 0 and 65535 mean unknown. The content decides the format. A `unit`
+    replaces metres and millimetres.
 
     Disparity d becomes depth = baseline · focal / (d + doffs); inf (in a PNG also 0) means unknown.
     A file holds disparity if `calib` is given, if a `scene.json` in the same folder names the file
@@ -185,6 +188,9 @@ def read_stored_depth(source: StrPath | DepthValue, *, grey: bool = False) -> St
             return StoredDepth(read_exr_depth(file, path), path)
         if magic.startswith(PFM_MAGIC):
             return StoredDepth(read_image(path, lambda image: np.array(image)), path)
+        if magic in TIFF_MAGICS:
+            numbers = read_image(path, lambda image: _grey_values(image, path, grey))
+            return StoredDepth(numbers, path, is_picture=numbers.dtype.kind in "iu")
         if magic.startswith(PFM_COLOUR_MAGIC):
             raise InputError(
                 f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)"
@@ -194,9 +200,11 @@ def read_stored_depth(source: StrPath | DepthValue, *, grey: bool = False) -> St
     if grey:
         numbers = read_image(path, lambda image: _grey_values(image, path, grey))
         return StoredDepth(numbers, path)
+    kind = kind_of_file(path)
+    what = "not a depth map" if kind is UNKNOWN else f"a {kind.name} file, no depth map"
     raise InputError(
-        f"{path}: not a depth map: give .npy, .npz, .pfm or .exr in metres, "
-        "or a 16-bit .png in millimetres"
+        f"{path}: {what}: give .npy, .npz, .pfm, .exr or .tif of floats in metres, "
+        "or a 16-bit .png or .tif in millimetres"
     )
 
 
@@ -204,7 +212,7 @@ def _stored_depth_of_value(source: DepthValue, grey: bool) -> StoredDepth:
     """The numbers [H, W] of a map that a program holds, and its mask; see `read_stored_depth`."""
     value = source.value
     path = source.path
-    if isinstance(value, Image.Image) and value.mode != "F":
+    if isinstance(value, Image.Image) and value.mode != "F":  # floats are read as an array
         with as_input_error(path, "the picture cannot be used ({reason}): give another one"):
             return StoredDepth(_grey_values(value, path, grey), path, is_picture=True)
 
@@ -242,7 +250,7 @@ def _check_shape(shape: tuple[int, ...], path: StrPath, file_bytes: int | None) 
 
 
 def _grey_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
-    """The numbers [H, W] of a picture with one channel: uint8, or uint16 from deeper ones.
+    """The numbers [H, W] of a picture with one channel: uint8, uint16 from deeper ones, or floats.
 
     With `grey`, a picture with several channels is taken, too, if they are nearly equal. InputError
     for pictures with colours.
@@ -250,7 +258,7 @@ def _grey_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
     if min(image.size) < 1:
         raise InputError(f"{path}: a picture without pixels: give another one")
     check_pixel_count(image.width, image.height, None, path)
-    if image.mode == "L":
+    if image.mode in ("L", "F"):  # 8 bits, or floats of 32 bits
         return np.asarray(image)
     # A PNG has at most 16 bits, for which Pillow uses integers of 16 or 32 bits. A picture that a
     # program made may hold larger ones.
@@ -260,13 +268,13 @@ def _grey_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
         if fits_16_bits:
             return numbers.astype(np.uint16)
         return numbers.astype(numbers.dtype.newbyteorder("="))  # the byte order of this machine
-    if not grey:
-        raise UnclearDepth.of(f"{path}: a picture with mode {image.mode} holds no millimetres")
 
     # A colour map (such as viridis) has no order of brightness from near to far.
     channels = np.asarray(image.convert("RGB")).astype(np.int16)  # [H, W, 3]
     if np.ptp(channels, axis=-1).max() >= MAX_CHANNEL_DIFFERENCE:
         raise InputError(f"{path}: {NOT_GREY}")
+    if not grey:
+        raise UnclearDepth.of(f"{path}: a picture with mode {image.mode} holds no millimetres")
     return channels[..., 1].astype(np.uint8)  # JPEG keeps green best
 
 
@@ -301,15 +309,20 @@ def _read_npy(file: IO[bytes], path: StrPath) -> Array:
 def _read_npz(file: IO[bytes], path: StrPath) -> Array:
     """Read the only array of an .npz archive, or the one that is called depth; else InputError."""
     with zipfile.ZipFile(file) as archive:
-        names = archive.namelist()
+        names = [name for name in archive.namelist() if name.endswith(".npy")]
+        if not names:  # PyTorch's files and those of offices are ZIP archives, too
+            raise InputError(
+                f"{path}: a ZIP archive without arrays of NumPy: save the depth by numpy.save"
+            )
         if "depth.npy" in names:
             name = "depth.npy"
         elif len(names) == 1:
             name = names[0]
         else:
+            listed = ", ".join(name.removesuffix(".npy") for name in names[:MAX_LISTED_ARRAYS])
             raise InputError(
-                f"{path}: holds {len(names)} arrays and none is called depth: "
-                "name one of them depth"
+                f"{path}: holds {len(names)} arrays ({short_repr(listed)}) and none is called "
+                "depth: name one of them depth"
             )
         with archive.open(name) as member:
             return _read_npy(member, path)

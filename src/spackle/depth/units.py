@@ -41,7 +41,6 @@ INVERSE_METRES = "1/m"
 MAX_UNIT_M = 1e9  # a unit, or its inverse, beyond this is a typing error
 
 UNKNOWN_UINT16 = 65535  # the highest number of 16 bits means unknown in a picture, as 0 does
-IMPLAUSIBLE_MEDIAN_INTEGER = 500  # whole numbers around or above this are hardly metres
 IMPLAUSIBLE_MEDIAN_M = 1000  # half of a photo is hardly farther away than a kilometre
 FULL_RANGE_SHARE = 0.05  # relative maps come this close (as a share) to both ends of their range
 # The least and the greatest number that a map of floats has if it was scaled to 0..1 or 0..255.
@@ -175,7 +174,10 @@ def metric_depth(stored: StoredDepth, unit: DepthUnit | None = None) -> DepthMap
 
 
 def _check_usual_unit(stored: StoredDepth) -> None:
-    """UnclearDepth if integers cannot be the metres of an array, or the millimetres of a PNG."""
+    """UnclearDepth for integers of an array, and for pictures of 8 bits.
+
+    Only pictures of 16 bits have a usual unit, millimetres.
+    """
     if not stored.are_integers:
         return
     # In 8 bits, no depth could be over 255 mm. Such a picture holds relative depth instead, and
@@ -184,9 +186,10 @@ def _check_usual_unit(stored: StoredDepth) -> None:
         raise UnclearDepth.of(f"{stored.path}: 8 bits hold no metres")
     if stored.is_picture:
         return
+    # Nobody measures a scene in whole metres: the numbers are millimetres, or codes of a unit that
+    # an array does not state.
     median = np.median(stored.numbers)
-    if median > IMPLAUSIBLE_MEDIAN_INTEGER:
-        raise UnclearDepth.of(f"{stored.path}: integers around {median:.0f} are hardly metres")
+    raise UnclearDepth.of(f"{stored.path}: integers around {median:.0f} are hardly metres")
 
 
 def check_not_relative(stored: StoredDepth) -> None:
