@@ -25,7 +25,7 @@ from helpers.photo_files import (
     raw_file,
     squares,
 )
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 import spackle
 from spackle.core.focal_length import FocalSource
@@ -378,6 +378,26 @@ def test_a_360_photo_of_a_known_camera_needs_no_xmp(tmp_path: Path) -> None:
         assert (
             load_photo(written(tmp_path / "a", encoded("JPEG", picture(), **options))).width == 64
         )
+
+
+def test_a_panorama_that_imagemagick_made_a_png_is_refused(tmp_path: Path) -> None:
+    xmp = gpano(ProjectionType="equirectangular", FullPanoWidthPixels=512)
+    text = PngImagePlugin.PngInfo()
+    text.add_text("Raw profile type xmp", f"\nxmp\n{len(xmp):8}\n{xmp.hex()}\n", zip=True)
+    picture = io.BytesIO()
+    Image.new("RGB", (64, 64)).save(picture, "PNG", pnginfo=text)
+    with pytest.raises(InputError, match="a panorama"):
+        load_photo(written(tmp_path / "a.png", picture.getvalue()))
+
+
+def test_what_was_not_fetched_is_named_with_what_to_do(tmp_path: Path) -> None:
+    for name, says in (
+        ("pointer of Git LFS", "git lfs pull"),
+        ("HTML", "download the file itself"),
+        ("AppleDouble", "leave it out"),
+    ):
+        with pytest.raises(InputError, match=says):
+            load_photo(written(tmp_path / "a.jpg", CODES_OF_KINDS[name] + bytes(200)))
 
 
 def test_a_swept_panorama_of_an_iphone_is_refused(tmp_path: Path) -> None:

@@ -167,7 +167,7 @@ def colmap_quaternion(one: Pose) -> list[float]:
 
 def write_colmap(folder: Path, model: str, parameters: list[float], *, binary: bool) -> Path:
     folder.mkdir(parents=True)
-    numbers = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+    numbers = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
     # The file's order is not that of the names.
     photos = list(zip([7, 3, 5], POSES, NAMES, strict=True))[::-1]
     if binary:
@@ -274,6 +274,14 @@ ROWS = {
         "COLMAP",
         note="distortion",
     ),
+    "eight numbers of distortion": Row(
+        lambda folder: write_colmap(
+            folder / "model", "FULL_OPENCV", [*DISTORTED, 0.01, 0.02, 0.03, 0.04], binary=False
+        ),
+        "COLMAP",
+        note="distortion",
+    ),
+    "shuffled cameras.json": Row(of_json("cameras.json", lambda: inria()[::-1]), "3DGS", MIDDLE),
     "metadata.json": Row(
         of_json("metadata.json", record3d), "Record3D", is_named=False, is_metric=True
     ),
@@ -486,11 +494,13 @@ def test_a_bad_file_is_refused_with_the_reason(name: str, tmp_path: Path) -> Non
 def test_what_holds_no_cameras_is_refused_with_what_is_wanted(tmp_path: Path) -> None:
     (tmp_path / "photo.jpg").write_bytes(b"anything")
     fisheye = write_colmap(tmp_path / "model", "OPENCV_FISHEYE", DISTORTED, binary=False)
+    binary_fisheye = write_colmap(tmp_path / "model2", "OPENCV_FISHEYE", DISTORTED, binary=True)
     for path, says in (
         (tmp_path, "COLMAP folder"),
         (tmp_path / "photo.jpg", "not a file of cameras"),
         (tmp_path / "none.json", "no such camera file"),
         (fisheye, "not a pinhole: undistort"),
+        (binary_fisheye, "camera model OPENCV_FISHEYE is not a pinhole: undistort"),
     ):
         with pytest.raises(InputError, match=re.escape(says)):
             read_camera_set(path)

@@ -410,6 +410,8 @@ UNSUPPORTED = {
     "ksplat": ("a.ksplat", bytes(5000), "splat-transform a.ksplat scene.ply"),
     "XGRIDS": ("a.lcc", b"{}", "splat-transform a.lcc scene.ply"),
     "USD": ("a.usdz", zipped({"a.usda": b""}), "save the scene as PLY"),
+    "a mesh": ("a.obj", b"v 0 0 0\n", "has no Gaussians: give a scene"),
+    "SuperSplat's project": ("a.ssproj", zipped({"document.json": b"{}"}), "export the scene"),
     "nerfstudio's checkpoint": ("a.ckpt", zipped({"data.pkl": b""}), "ns-export"),
 }
 
@@ -426,6 +428,32 @@ def test_a_sound_file_that_is_not_read_is_never_called_damaged(name: str, tmp_pa
     assert says in message
     assert not re.search("damaged|cut off|export it again|another program", message)
     assert re.search("save|give|convert|unpack|export|put|not a Gaussian scene", message)
+
+
+def test_the_folder_of_a_training_names_its_newest_scene(tmp_path: Path) -> None:
+    for number in (7000, 30000):
+        folder = tmp_path / "point_cloud" / f"iteration_{number}"
+        folder.mkdir(parents=True)
+        write(folder, {"point_cloud.ply": ply(TABLE)})
+    newest = tmp_path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    for folder in (tmp_path, tmp_path / "point_cloud"):
+        with pytest.raises(InputError, match="the folder of a training: give its scene") as caught:
+            load_scene(folder)
+        assert str(caught.value).endswith(f", {newest}")
+
+
+def test_what_stands_in_place_of_a_scene_is_named(tmp_path: Path) -> None:
+    for content, says in (
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        (b"<!DOCTYPE html><html>", "a web page: download the file itself"),
+    ):
+        with pytest.raises(InputError, match=says):
+            load_scene(write(tmp_path, {"a.ply": content}))
+
+
+def test_a_splat_of_an_odd_length_says_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="70 bytes, which is no multiple of 32"):
+        load_scene(write(tmp_path, {"a.splat": bytes(70)}))
 
 
 def zip_bomb(version: int) -> bytes:

@@ -28,6 +28,7 @@ class FileKind:
     suffixes: tuple[str, ...] = ()  # in lower case; the first one is the usual one
     is_raw: bool = False  # the data of a sensor, with a preview inside
     is_video: bool = False
+    advice: str = EXPORT_ADVICE  # what to do with a file of this format that is no photo
 
     @property
     def is_photo(self) -> bool:
@@ -64,10 +65,14 @@ PHOTO_SUFFIXES = tuple(
 
 VIDEO = FileKind("video", is_video=True)
 
+# What stands in place of a file that was not fetched.
+GIT_LFS = FileKind("pointer of Git LFS", advice="fetch the file itself: `git lfs pull`")
+WEB_PAGE = FileKind("HTML", advice="it is a web page: download the file itself")
+
 # Formats by their first bytes. The longest ones come first, because some begin alike.
 _MAGIC: tuple[tuple[bytes, FileKind], ...] = (
     (b"FUJIFILMCCD-RAW", RAW),
-    (b"version https://git-lfs", FileKind("pointer of Git LFS")),
+    (b"version https://git-lfs", GIT_LFS),
     (b"\x00\x00\x00\x0cJXL \r\n\x87\n", FileKind("JPEG XL")),
     (b"\x00\x00\x00\x0cjP  \r\n\x87\n", FileKind("JPEG 2000")),
     (b"\x89PNG\r\n\x1a\n", PNG),
@@ -77,7 +82,10 @@ _MAGIC: tuple[tuple[bytes, FileKind], ...] = (
     (b"\xff\x4f\xff\x51", FileKind("JPEG 2000")),
     (b"\xc5\xd0\xd3\xc6", FileKind("PostScript")),
     (b"\x76\x2f\x31\x01", FileKind("OpenEXR")),
-    (b"\x00\x05\x16\x07", FileKind("AppleDouble")),
+    (
+        b"\x00\x05\x16\x07",
+        FileKind("AppleDouble", advice="leave it out: macOS keeps notes about another file in it"),
+    ),
     (b"\x1a\x45\xdf\xa3", VIDEO),  # Matroska and WebM
     (b"II*\x00", TIFF),
     (b"MM\x00*", TIFF),
@@ -103,8 +111,8 @@ _MAGIC: tuple[tuple[bytes, FileKind], ...] = (
 _PNM_MAGIC = tuple(b"P%c" % letter for letter in b"123456Ff")
 _MARKUP = (
     (b"<svg", FileKind("SVG")),
-    (b"<!doctype html", FileKind("HTML")),
-    (b"<html", FileKind("HTML")),
+    (b"<!doctype html", WEB_PAGE),
+    (b"<html", WEB_PAGE),
 )
 UNKNOWN = FileKind("unknown")
 
@@ -170,7 +178,7 @@ def kind_of_file(path: str | os.PathLike[str]) -> FileKind:
 def not_a_photo(path: str | os.PathLike[str], kind: FileKind) -> InputError:
     """The error for a file of a format that is no photo's."""
     what = "not an image of a known format" if kind is UNKNOWN else f"a {kind.name} file, no photo"
-    return InputError(f"{path}: {what}: {EXPORT_ADVICE}")
+    return InputError(f"{path}: {what}: {kind.advice}")
 
 
 def list_photos(

@@ -6,6 +6,7 @@ curved, and the scene would be bent without a word.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections.abc import Mapping
@@ -176,4 +177,11 @@ def xmp_of_image(image: Image.Image, exif: Mapping[int, object]) -> bytes:
             return packet
         if isinstance(packet, tuple):  # bytes as numbers, as TIFF stores them
             return bytes(number & 0xFF for number in packet if isinstance(number, int))
+
+    # ImageMagick writes it into PNGs as text: a line "xmp", one with the length, then hex numbers.
+    profile = image.info.get("Raw profile type xmp")
+    if isinstance(profile, str):
+        lines = profile.split("\n", 3)
+        with contextlib.suppress(ValueError):
+            return bytes.fromhex(lines[-1])
     return b""

@@ -19,7 +19,7 @@ from PIL import Image
 
 from spackle.core.array_values import plain_array, without_unit_axes
 from spackle.core.image_files import check_pixel_count, read_image
-from spackle.core.image_formats import UNKNOWN, kind_of_file
+from spackle.core.image_formats import GIT_LFS, UNKNOWN, WEB_PAGE, kind_of_file
 from spackle.depth.calibration import (
     LARGEST_NUMBER,
     Calibration,
@@ -201,6 +201,8 @@ def read_stored_depth(source: StrPath | DepthValue, *, grey: bool = False) -> St
         numbers = read_image(path, lambda image: _grey_values(image, path, grey))
         return StoredDepth(numbers, path)
     kind = kind_of_file(path)
+    if kind in (GIT_LFS, WEB_PAGE):
+        raise InputError(f"{path}: a {kind.name} file, no depth map: {kind.advice}")
     what = "not a depth map" if kind is UNKNOWN else f"a {kind.name} file, no depth map"
     raise InputError(
         f"{path}: {what}: give .npy, .npz, .pfm, .exr or .tif of floats in metres, "

@@ -133,6 +133,7 @@ class _NerfPathFile(BaseModel):
 class _InriaCamera(BaseModel):
     """A camera in INRIA's cameras.json."""
 
+    id: int | None = None  # the place in the order of the pictures
     img_name: str = ""
     width: SidePx
     height: SidePx
@@ -452,8 +453,15 @@ def _read_inria(path: Path, content: Any) -> CameraSet:
     if not is_inria:
         raise InputError(f"{path}: not a file of cameras: {KNOWN_KINDS}")
     file = _validated(_InriaFile, content, path)
+    # A program may have shuffled the list; the numbers tell the order in which pictures follow.
+    ids = [entry.id for entry in file.root if entry.id is not None]
+    entries = file.root
+    if len(set(ids)) == len(entries):
+        entries = [
+            entry for _, entry in sorted(zip(ids, entries, strict=True), key=lambda of: of[0])
+        ]
     cameras = []
-    for index, entry in enumerate(file.root):
+    for index, entry in enumerate(entries):
         K = _intrinsics(entry.fx, entry.fy, entry.width / 2, entry.height / 2)
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = torch.tensor(entry.rotation, dtype=torch.float64)
@@ -464,7 +472,7 @@ def _read_inria(path: Path, content: Any) -> CameraSet:
         source=path,
         kind="3DGS",
         cameras=tuple(cameras),
-        names=tuple(entry.img_name for entry in file.root),
+        names=tuple(entry.img_name for entry in entries),
         origin=torch.eye(4, dtype=torch.float64),
     )
 

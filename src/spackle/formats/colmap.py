@@ -45,6 +45,16 @@ LENS_MODELS = {
     2: LensModel("SIMPLE_RADIAL", 4),
     3: LensModel("RADIAL", 5),
     4: LensModel("OPENCV", 8),
+    6: LensModel("FULL_OPENCV", 12),
+}
+# Names of the models that are refused, by number: fisheyes, except for FOV.
+OTHER_MODELS = {
+    5: "OPENCV_FISHEYE",
+    7: "FOV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
 }
 # Lens models with one focal length; the others have fx and fy.
 SINGLE_FOCAL_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -99,7 +109,8 @@ class Lens(NamedTuple):
     """A lens of a model."""
 
     camera: Camera  # a float64 pinhole at the world's origin
-    distortion: list[float]  # k1, k2, p1, p2; the list may end earlier, the others are 0
+    # k1, k2, p1, p2, k3, k4, k5, k6; the list may end earlier, the others are 0.
+    distortion: list[float]
 
 
 def read_lenses(folder: Path) -> dict[int, Lens]:
@@ -145,9 +156,11 @@ def _lens_of_record(path: Path, record: CameraRecord) -> Lens:
     """
     model = _lens_model(record.model)
     if model is None or len(record.parameters) != model.parameter_count:
+        name = record.model
+        if isinstance(name, int):
+            name = OTHER_MODELS.get(name, str(name))
         raise InputError(
-            f"{path}: camera model {record.model} is not a pinhole: undistort the photos with "
-            "COLMAP first"
+            f"{path}: camera model {name} is not a pinhole: undistort the photos with COLMAP first"
         )
 
     # Models with one focal length have f, cx, cy; the others fx, fy, cx, cy. Then comes distortion.

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
+from spackle.core.image_formats import GIT_LFS, HEAD_BYTES, WEB_PAGE, kind_of_bytes
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 
@@ -145,6 +146,9 @@ class PlyTables:
         with open(path, "rb") as file:
             head = file.read(MAX_HEADER_BYTES)
         first_line = head.split(b"\n", 1)[0].rstrip()
+        kind = kind_of_bytes(head[:HEAD_BYTES])
+        if kind in (GIT_LFS, WEB_PAGE):
+            raise InputError(f"{path}: a {kind.name} file, no scene: {kind.advice}")
         if first_line != b"ply":
             problem = "not a PLY file: its first line must be 'ply'"
             raise InputError(f"{path}: {problem} (`spackle predict` makes one)")

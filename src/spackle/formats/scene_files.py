@@ -54,6 +54,10 @@ READABLE_SUFFIXES = (".ply", *SCENE_READERS)
 EXPORT_AGAIN = "give the scene.ply from which the page was made"
 CONVERT = "convert it, for example with PlayCanvas's tool: `splat-transform {name} scene.ply`"
 SAVE_AS_PLY = "save the scene as PLY in the program that wrote it"
+NO_GAUSSIANS = (
+    "a mesh or a cloud of points, which has no Gaussians: give a scene of Gaussians, such as a PLY "
+    "of 3DGS"
+)
 UNREAD_SUFFIXES = {
     ".html": EXPORT_AGAIN,
     ".ksplat": CONVERT,  # of three.js
@@ -66,7 +70,11 @@ UNREAD_SUFFIXES = {
     ".usda": SAVE_AS_PLY,
     ".usdc": SAVE_AS_PLY,
     ".usdz": SAVE_AS_PLY,
+    ".ssproj": "export the scene from SuperSplat as PLY",
     ".ckpt": "export it first: `ns-export gaussian-splat` of nerfstudio writes a PLY",
+    **dict.fromkeys(
+        (".obj", ".fbx", ".stl", ".dae", ".las", ".laz", ".pcd", ".xyz", ".e57"), NO_GAUSSIANS
+    ),
 }
 
 # The first bytes of a file of each format; a .splat file begins with its first Gaussian.
@@ -118,8 +126,27 @@ def scene_suffix(path: Path) -> str | None:
 
 
 def is_scene_folder(path: Path) -> bool:
-    """Return whether a path is a folder with an unbundled SOG scene."""
+    """Return whether a path is a folder with an unbundled SOG scene.
+
+    InputError for the folder of a training of 3DGS, which names the scene in it.
+    """
+    trained_scene = _trained_scene(path)
+    if trained_scene is not None:
+        raise InputError(f"{path}: the folder of a training: give its scene, {trained_scene}")
     return (path / META_NAME).is_file()
+
+
+def _trained_scene(folder: Path) -> Path | None:
+    """The newest scene in the folder of a training of 3DGS; None if it is no such folder."""
+    scenes = [*folder.glob("point_cloud/iteration_*/point_cloud.ply")]
+    scenes += folder.glob("iteration_*/point_cloud.ply")
+
+    def iteration(scene: Path) -> int:
+        """The number of training steps after which a scene was saved."""
+        number = scene.parent.name.removeprefix("iteration_")
+        return int(number) if number.isdecimal() else 0
+
+    return max(scenes, key=iteration, default=None)
 
 
 def load_scene(path: Path) -> SceneFile:

@@ -40,6 +40,10 @@ def decode_splat(data: bytes) -> DecodedScene:
     Raises:
         ValueError: the file ends within a Gaussian.
     """
+    if len(data) % SPLAT_ROW.itemsize:
+        raise ValueError(
+            f"{len(data)} bytes, which is no multiple of {SPLAT_ROW.itemsize}, those of a Gaussian"
+        )
     rows = np.frombuffer(data, SPLAT_ROW)
     rgba = codes_to_fractions(rows["rgba"], 255)  # [N, 4]
     # NaN scales stay NaN, and `to_gaussians` refuses them.

@@ -159,6 +159,15 @@ def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     cameras = stored("tanks", tmp_path / "tanks/Truck") / "sparse/0/cameras.bin"
     cameras.write_bytes(lens(2, FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
     assert "distorts the corners of photos: undistort" in error_of("tanks", tmp_path / "tanks")
+    # FULL_OPENCV: k1, k2, p1, p2, then k3 of r⁷ and the divisor's k4, k5, k6.
+    pinhole = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    for place in (4, 5):
+        distortion = [0.0] * 8
+        distortion[place] = 0.4
+        cameras.write_bytes(lens(6, *pinhole, *distortion))
+        assert "distorts the corners" in error_of("tanks", tmp_path / "tanks")
+    cameras.write_bytes(lens(6, *pinhole, *[0.0] * 8))
+    assert read_cases("tanks", tmp_path / "tanks")
     # The corners of a long lens are near the axis.
     cameras.write_bytes(lens(2, 20 * FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
     assert read_cases("tanks", tmp_path / "tanks")

@@ -158,19 +158,25 @@ def _check_distortion(folder: Path, lens: Lens) -> None:
 def _max_distortion_shift(distortion: Sequence[float], squared_radius: float) -> float:
     """How far a lens may shift a point at most, at focal length 1.
 
-    Radial distortion shifts a point at the radius r by k1 r³ + k2 r⁵; tangential distortion
+    Radial distortion shifts a point at the radius r by k1 r³ + k2 r⁵ + k3 r⁷; a divisor of
+    1 + k4 r² + k5 r⁴ + k6 r⁶ shifts it by as much again, to first order. Tangential distortion
     shifts it by at most 3 (|p1| + |p2|) r².
 
     Args:
-        distortion: k1, k2, p1, p2. The list may end earlier; the numbers that are missing are 0.
+        distortion: k1, k2, p1, p2, k3, k4, k5, k6. The list may end earlier; the numbers that are
+            missing are 0.
         squared_radius: r², the point's squared distance from the optical axis.
     """
-    radial = distortion[:2]
-    tangential = distortion[2:]
+    numbers = [*distortion, *[0.0] * (8 - len(distortion))]
+    k1, k2, p1, p2, *further = numbers
+    tangential = [p1, p2]
+    numerator = [k1, k2, further[0]]
+    divisor = further[1:]
     shift = 0.0
-    for order, k in enumerate(radial):
-        # (r²)^1.5 is r³, and (r²)^2.5 is r⁵.
-        shift += abs(k) * squared_radius ** (order + 1.5)
+    for radial in (numerator, divisor):
+        for order, k in enumerate(radial):
+            # (r²)^1.5 is r³, (r²)^2.5 is r⁵, and (r²)^3.5 is r⁷.
+            shift += abs(k) * squared_radius ** (order + 1.5)
     return shift + 3 * sum(abs(p) for p in tangential) * squared_radius
 
 
