@@ -3,357 +3,325 @@
     python benchmarks/reproduce.py -o reproduction
 
 Each command that a reader would type is printed and run; docs/reproduction.md has them at the
-paper's size. Each of the
-six datasets is replaced by one scene in its layout: one is real (scikit-image's Motorcycle), five
-are synthetic, made from scikit-image's other pictures. SHARP is replaced by a network of its
-architecture for 512² pixels, with random weights, fitted to the synthetic scenes' depth; it
-predicts nearly the same depth for all photos.
+paper's size. What is shown:
+
+- Real photos come first: Middlebury's Motorcycle with its measured depth (base `rgbd`), and three
+  photos of scikit-image with depth by the package's own small networks (base `lite`).
+- The layouts of the paper's other datasets hold rendered scenes, which are called so everywhere.
+- SHARP's weights cannot be had without a download. Where the experiment trains SHARP itself, or a
+  network that starts from it, a stand-in takes its place, which is called so everywhere, too.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import os
 import shlex
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import dataset_layouts as layouts
 import numpy as np
+import rendered_scenes
 import torch
-from numpy.typing import NDArray
 from PIL import Image
-from random_weights import deterministic_weights
-from safetensors.torch import load_file, save_file
+from reproduced_claims import FILE as CLAIMS_FILE
+from reproduced_claims import claims_of_folder
+from sharp_stand_in import write_stand_in
 from skimage import data as pictures
-from torch.nn.functional import grid_sample, interpolate, unfold
 
-from spackle.bases.sharp.base import expected_shapes, load_network, resize_to_square
-from spackle.bases.sharp.encoder import MICRO_SIZE, WINDOW_COUNT
-from spackle.paper.evaluation.datasets import stereo
+WIDTH = 480  # of rendered photos, in pixels
+SIDE = 320  # long side of the views in tables, in pixels; figures show the photos' full size
+MAX_PHOTO_SIDE = 480  # long side of scikit-image's photos, in pixels
+TRAINING_SIDE = 224  # long side of the training photos, in pixels
 
-WIDTH, HEIGHT = 192, 144
-# the focal length assumed for photos without metadata
-FOCAL = math.hypot(WIDTH, HEIGHT) * 30 / math.hypot(36, 24)
-WALL, OBJECT = 4.0, 2.2  # depths of a synthetic scene's two surfaces, in metres
-SIZE, LOW = 1.1, 0.1  # the object's size, and how far its middle is below the photo's, in metres
-EYES = (0.0, 0.35, -0.35)  # eyes' positions to the right, in metres; the first is the photo's
-BASELINE = EYES[1]
-RANKS, VIEWS, STEPS = 2, 6, 40
-PICTURED = ("middlebury", "wildrgbd", "tanks")  # datasets in the figures
-Array = NDArray[Any]
+# Photos that are evaluated, and those from which the training set is made.
+SHOWN_PHOTOS = ("astronaut", "coffee", "chelsea")
+TRAINING_PHOTOS = (*SHOWN_PHOTOS, "rocket", "camera", "clock")
+
+RANKS = 2  # processes of a training, one for each core
+VIEWS = 6  # of a training photo
+STEPS = 40  # of a training
+AT_ONCE = 2  # evaluations that run side by side, one for each core
 
 
-class Scene(NamedTuple):
-    """An object in front of a wall, both flat and facing the camera, each showing a picture of
-    scikit-image.
-    """
+class Set(NamedTuple):
+    """A folder of scenes in the layout of a dataset, and the base that evaluates it."""
 
-    wall: str
-    front: str
-
-    def seen(self, eye: float = 0.0) -> tuple[Array, Array]:
-        """Photo [H, W, 3] and depth [H, W] from an eye `eye` metres to the right."""
-        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        right, down = (x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL
-        u, v = (OBJECT * right + eye) / SIZE, (OBJECT * down - LOW) / SIZE
-        inside = u**4 + v**4 < 0.5**4
-        wall, front = (
-            painted(self.wall, (WALL * right + eye) / 8, WALL * down / 6),
-            painted(self.front, u, v),
-        )
-        return np.where(inside[..., None], front, wall), np.where(inside, OBJECT, WALL).astype(
-            np.float32
-        )
+    name: str  # of its folder
+    layout: str  # a dataset that `spackle evaluate` reads
+    base: str
+    has_second_photos: bool = True
+    in_figure: bool = False
 
 
-def painted(name: str, u: Array, v: Array) -> Array:
-    """Colours [H, W, 3] of a picture at (u, v); (0, 0) is its middle, ±½ its border."""
-    picture = (
-        torch.from_numpy(np.atleast_3d(getattr(pictures, name)())[..., :3].copy())
-        .float()
-        .movedim(-1, 0)
-    )
-    place = torch.from_numpy(2 * np.stack([u, v], -1)).float()
-    colors = grid_sample(picture[None], place[None], padding_mode="border", align_corners=False)[0]
-    return colors.expand(3, -1, -1).movedim(0, -1).round().byte().numpy()
+SETS = (
+    Set("motorcycle", "middlebury", "rgbd", in_figure=True),
+    Set("photos", "photos", "lite", has_second_photos=False, in_figure=True),
+    Set("still_life", "booster", "rgbd", in_figure=True),
+    Set("toy_truck", "wildrgbd", "rgbd", in_figure=True),
+    Set("yard", "tanks", "rgbd"),
+    Set("hall", "eth3d", "rgbd"),
+    Set("fern", "llff", "lite"),  # LLFF has bounds of the depth, but no depth
+)
+# Sets on which the stand-in of SHARP is compared with its fine-tuned self.
+STAND_IN_SETS = ("motorcycle", "still_life", "toy_truck")
 
-
-SCENES = {
-    "booster": Scene("brick", "coffee"),
-    "wildrgbd": Scene("gravel", "chelsea"),
-    "tanks": Scene("rocket", "astronaut"),
-    "eth3d": Scene("coffee", "rocket"),
-    "llff": Scene("grass", "astronaut"),
+# For each rendered set: how its layout is written, and how many photos it has.
+WRITERS = {
+    "still_life": (layouts.write_booster, 2),
+    "toy_truck": (layouts.write_wildrgbd, 3),
+    "yard": (layouts.write_tanks, 3),
+    "hall": (layouts.write_eth3d, 3),
+    "fern": (layouts.write_llff, 3),
 }
-WALLS = ["astronaut", "chelsea", "coffee", "brick", "rocket", "gravel"]
-LEARNED = [Scene(wall, front) for wall, front in zip(WALLS, WALLS[1:] + WALLS[:1], strict=True)]
+LAYOUT_TITLES = {
+    "booster": "Booster",
+    "wildrgbd": "WildRGB-D",
+    "tanks": "Tanks and Temples",
+    "eth3d": "ETH3D",
+    "llff": "LLFF",
+}
 
 
-# The six datasets ---------------------------------------------------------------------------------
+# --- data
 
 
-def save(path: Path, image: Array) -> None:
-    """Write a picture; missing folders are created."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(image).save(path)
+def make_data(data: Path, training_photos: Path) -> None:
+    """Write the sets, and the photos from which the training set is made."""
+    layouts.write_middlebury(data / "motorcycle")
+    for name in SHOWN_PHOTOS:
+        layouts.save_image(data / "photos" / f"{name}.png", photo(name, MAX_PHOTO_SIDE))
+    about = "three photos that scikit-image brings"
+    layouts.write_about(data / "photos", "Photos of scikit-image", about)
+    for name in TRAINING_PHOTOS:
+        layouts.save_image(training_photos / f"{name}.png", photo(name, TRAINING_SIDE))
+
+    for one in SETS:
+        if one.name not in WRITERS:
+            continue
+        began = time.monotonic()
+        write, count = WRITERS[one.name]
+        scene = rendered_scenes.SCENES[one.name]()
+        write(data / one.name, layouts.render_frames(scene, WIDTH, count))
+        title = scene.name.capitalize()
+        layout = LAYOUT_TITLES[one.layout]
+        layouts.write_about(data / one.name, title, f"rendered, in {layout}'s layout")
+        print(f"{title}: {count} photos in {time.monotonic() - began:.0f} s", flush=True)
 
 
-def middlebury(scene: Path) -> None:
-    """Write the Motorcycle at half of scikit-image's size, with a scene.json."""
-    left, right, disparity = pictures.stereo_motorcycle()
-    save(scene / "left.png", np.asarray(Image.fromarray(left).reduce(2)))
-    save(scene / "right.png", np.asarray(Image.fromarray(right).reduce(2)))
-    np.save(scene / "disparity.npy", disparity[::2, ::2] / 2)
-    facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
-    pixels = {
-        "focal_px": stereo.MOTORCYCLE_FOCAL_PX,
-        "cx": stereo.MOTORCYCLE_CX_PX,
-        "cy": stereo.MOTORCYCLE_CY_PX,
-    }
-    pixels["doffs_px"] = stereo.MOTORCYCLE_DOFFS_PX
-    facts |= {name: value / 2 for name, value in pixels.items()} | {
-        "baseline_m": stereo.MOTORCYCLE_BASELINE_M
-    }
-    (scene / "scene.json").write_text(json.dumps(facts))
+def photo(name: str, max_side: int) -> np.ndarray:
+    """A photo of scikit-image, [H, W, 3] bytes, with at most this long side in pixels."""
+    image = Image.fromarray(getattr(pictures, name)()).convert("RGB")
+    image.thumbnail((max_side, max_side), Image.Resampling.LANCZOS)
+    return np.asarray(image)
 
 
-def booster(scene: Path, made: Scene) -> None:
-    """Write a scene as in Booster, with OpenCV's calibration: millimetres, pixel centres at
-    integers.
-    """
-    photo, depth = made.seen()
-    save(scene / "camera_00" / "im0.png", photo)
-    save(scene / "camera_02" / "im0.png", made.seen(BASELINE)[0])
-    np.save(scene / "disp_00.npy", FOCAL * BASELINE / depth)
-    numbers = f"{FOCAL} 0 {WIDTH / 2 - 0.5} 0 0 {FOCAL} {HEIGHT / 2 - 0.5} 0 0 0 1 0"
-    matrix = f"<rows>3</rows><cols>4</cols><data>{numbers}</data>"
-    sides = f"<proj_matL>{matrix}</proj_matL><proj_matR>{matrix}</proj_matR>"
-    text = f"<opencv_storage>{sides}<baselineLR>{1000 * BASELINE}</baselineLR></opencv_storage>"
-    (scene / "calib_00-02.xml").write_text(text)
+# --- the paper's chain
 
 
-def wildrgbd(scene: Path, made: Scene, scale: float = 0.2) -> None:
-    """Write a scene as in WildRGB-D, scaled to a hand-held object, with depth in millimetres."""
-    poses = ""
-    for number, eye in enumerate(EYES):
-        photo, depth = made.seen(eye)
-        save(scene / "rgb" / f"{number:05d}.png", photo)
-        save(
-            scene / "depth" / f"{number:05d}.png", (1000 * scale * depth).round().astype(np.uint16)
-        )
-        poses += f"{number} 1 0 0 {scale * eye} 0 1 0 0 0 0 1 0 0 0 0 1\n"
-    (scene / "cam_poses.txt").write_text(poses)
-    K = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, 1]  # column by column
-    (scene / "metadata").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "K": K}))
-
-
-def colmap(photos: Path, model: Path, made: Scene, above: str = "") -> None:
-    """Write photos and a COLMAP model as text, with a point at every eighth pixel of the first
-    photo.
-    """
-    depth, images = made.seen()[1][4::8, 4::8], ""
-    v, u = np.mgrid[4:HEIGHT:8, 4:WIDTH:8] + 0.5
-    points = np.stack(
-        [(u - WIDTH / 2) * depth / FOCAL, (v - HEIGHT / 2) * depth / FOCAL, depth], -1
-    ).reshape(-1, 3)
-    for number, eye in enumerate(EYES, 1):
-        save(photos / f"{number:03d}.jpg", made.seen(eye)[0])
-        where = FOCAL * (points[:, :2] - [eye, 0]) / points[:, 2:] + [WIDTH / 2, HEIGHT / 2]
-        seen = [
-            f"{x} {y} {k}" for k, (x, y) in enumerate(where) if 0 <= x < WIDTH and 0 <= y < HEIGHT
-        ]
-        images += f"{number} 1 0 0 0 {-eye} 0 0 1 {above}{number:03d}.jpg\n{' '.join(seen)}\n"
-    model.mkdir(parents=True)
-    (model / "cameras.txt").write_text(
-        f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
-    )
-    (model / "images.txt").write_text(images)
-    (model / "points3D.txt").write_text(
-        "".join(f"{k} {x} {y} {z} 0 0 0 0.1\n" for k, (x, y, z) in enumerate(points))
-    )
-
-
-def llff(scene: Path, made: Scene) -> None:
-    """Write a scene as in LLFF: for each photo the columns down, right, backwards, eye and lens,
-    then bounds.
-    """
-    rows = []
-    for number, eye in enumerate(EYES):
-        save(scene / "images_4" / f"image{number:03d}.png", made.seen(eye)[0])
-        pose = [[0, 1, 0, eye, HEIGHT], [1, 0, 0, 0, WIDTH], [0, 0, -1, 0, FOCAL]]
-        rows.append([*np.ravel(pose), OBJECT, WALL])
-    np.save(scene / "poses_bounds.npy", np.array(rows))
-
-
-def make_data(data: Path, photos: Path) -> None:
-    """Write the six datasets, and photos for training."""
-    middlebury(data / "middlebury" / "Motorcycle")
-    booster(data / "booster" / "train" / "balanced" / "Table", SCENES["booster"])
-    wildrgbd(data / "wildrgbd" / "bowl" / "scenes" / "scene_000", SCENES["wildrgbd"])
-    truck, pipes, undistorted = (
-        data / "tanks" / "Truck",
-        data / "eth3d" / "pipes",
-        "dslr_images_undistorted/",
-    )
-    colmap(truck / "images", truck / "sparse" / "0", SCENES["tanks"])
-    colmap(
-        pipes / "images" / undistorted,
-        pipes / "dslr_calibration_undistorted",
-        SCENES["eth3d"],
-        undistorted,
-    )
-    llff(data / "llff" / "fern", SCENES["llff"])
-    for number, made in enumerate(LEARNED):
-        save(photos / f"{number}.png", made.seen()[0])
-
-
-@torch.no_grad()
-def fit_sharp(random: Path, fitted: Path) -> None:
-    """Fit random weights to the depth of synthetic scenes; deltas start at zero, opacities near
-    one.
-
-    The tokens of the whole image get low-frequency position embeddings. All of the decoder is
-    zeroed but the path from these tokens to the disparities, which is thus linear and nearly the
-    same for all photos.
-    """
-    weights, grid, depths = (
-        load_file(random),
-        MICRO_SIZE.tokens_per_side,
-        "monodepth_model.monodepth_predictor.",
-    )
-    across = (np.arange(grid) + 0.5) * math.pi / grid
-    waves = sorted(((m, n) for m in range(grid) for n in range(grid)), key=sum)[
-        : MICRO_SIZE.embed_width
-    ]
-    places = np.stack(
-        [np.outer(np.cos(m * across), np.cos(n * across)).ravel() for m, n in waves], -1
-    )
-    weights[f"{depths}encoder.image_encoder.pos_embed"][0, 1:] += 30 * torch.from_numpy(places)
-    parts = ("decoder", "head", "encoder.upsample_latent0", "encoder.upsample2")
-    closed = ("prediction_head.", *(f"{depths}{part}." for part in parts))
-    for name in [name for name in weights if name.startswith(closed)]:
-        weights[name].zero_()
-        if name.endswith((".out_conv.weight", ".deconv.weight")):
-            weights[name] += torch.eye(MICRO_SIZE.depth_width)[..., None, None]
-    for layer, tap in (
-        ("0", 1),
-        ("1", slice(None)),
-        ("2", 1),
-        ("4", 0),
-    ):  # channel 0: the nearer surface
-        weights[f"{depths}head.{layer}.weight"][0, 0, tap, tap] = 1.0
-    weights[f"{depths}head.4.weight"][1, 0] = 0.97  # channel 1: the surface behind
-    weights["prediction_head.texture_prediction_head.bias"][-2:] = (
-        6.0  # the opacities, before their sigmoid
-    )
-    save_file(weights, fitted)
-    encoder: Any = load_network(fitted, torch.float32).monodepth_model.monodepth_predictor.encoder
-    seen, wanted = [], []
-    for photo, depth in (scene.seen() for scene in (*SCENES.values(), *LEARNED)):
-        coarsest = encoder(
-            2 * resize_to_square(torch.from_numpy(photo) / 255, MICRO_SIZE.side) - 1, WINDOW_COUNT
-        )[-1]
-        seen.append(unfold(coarsest, 3, padding=1)[0].T)
-        disparity = resize_to_square(
-            FOCAL / WIDTH / torch.from_numpy(depth)[..., None], MICRO_SIZE.side
-        )
-        wanted.append(interpolate(disparity, coarsest.shape[-2:], mode="area").flatten())
-    known, truth = torch.cat(seen).double(), torch.cat(wanted).double()
-    ridge = 1e-5 * len(truth) * torch.eye(known.shape[1]).double()
-    kernel = torch.linalg.solve(known.T @ known + ridge, known.T @ (truth - truth.mean()))
-    weights[f"{depths}decoder.convs.4.weight"][0] = kernel.float().view(-1, 3, 3)
-    weights[f"{depths}decoder.fusions.4.out_conv.bias"][0] = truth.mean().float()
-    save_file(weights, fitted)
-    off = (known @ kernel + truth.mean() - truth).var() / truth.var()
-    print(f"{fitted.name}: explains {1 - float(off):.0%} of the made scenes' disparity", flush=True)
-
-
-# The paper's chain --------------------------------------------------------------------------------
-
-
-def commands() -> list[str]:
-    """The command lines, from photos to tables and figures."""
-    sharp, residual = (
-        "--base sharp -c sharp.safetensors",
-        "--residual sharp-decoder/best.safetensors",
-    )
+def training_commands() -> list[str]:
+    """The command lines from training photos to a trained residual and a fine-tuned stand-in."""
+    stand_in = "--base sharp -c sharp_stand_in.safetensors"
     few = (
-        f"data.pseudo=pseudo data.validation_views={VIEWS} loss.features=none "
+        f"data.pseudo=pseudo data.validation_views={VIEWS} data.views=30 loss.features=none "
         "run.validate_every=10 optim.warmup=4"
     )
     train = f"torchrun --nproc-per-node {RANKS} --no-python spackle train --recipe"
-    crops = f"optim.steps={STEPS} optim.batch=4 data.views=30 data.crops=2 data.cells=32"
-    # high rates for few steps
+    # A high rate for direct FT, because few steps replace thousands.
     fast = f"optim.steps={STEPS // 2} optim.batch=8 optim.lr=4e-3 optim.min_lr=4e-4"
-    methods = "--methods base,paper,spackle,direct-ft,dense --direct-ft direct-ft/best.safetensors"
-    lines = [
-        f"spackle dataset build photos -o pseudo {sharp} --views {VIEWS} --inpainter exemplar "
-        f"--disparity 0.3 0.6",
+    return [
+        f"spackle dataset build training_photos -o pseudo {stand_in} --views {VIEWS} "
+        "--inpainter exemplar --disparity 0.3 0.6",
         "spackle dataset verify pseudo",
-        f"{train} paper -o unet network=unet {few} {crops}",
-        f"{train} paper -o sharp-decoder network=sharp-decoder init=sharp.safetensors {few} "
-        f"{crops}",
-        f"{train} direct_ft --method direct-ft -o direct-ft -c sharp.safetensors {few} {fast}",
+        f"{train} paper -o residual init=sharp_stand_in.safetensors {few} optim.steps={STEPS} "
+        "optim.batch=4",
+        f"{train} direct_ft --method direct-ft -o direct-ft -c sharp_stand_in.safetensors {few} "
+        f"{fast}",
     ]
-    measured, pictured = [], []
-    for name in ("middlebury", *SCENES):
-        photos = f"data/{name} --dataset {name} {sharp} {residual}"
-        lines += [
-            f"spackle evaluate {photos} {methods} -o runs/{name}-large",
-            f"spackle evaluate {photos} {methods} --protocol near-view -o runs/{name}-near",
-            f"spackle bench {photos} --runs 1 -o runs/{name}-bench",
-        ]
-        measured += [f"runs/{name}-{kind}" for kind in ("large", "near", "bench")]
-        if name in PICTURED:
-            lines.append(
-                f"spackle evaluate {photos} {methods} --disparity 0.6 -o runs/{name}-figure"
-            )
-            pictured.append(f"runs/{name}-figure")
-    lines.append(f"spackle tables {' '.join(measured)} -o tables --html")
-    return [*lines, f"spackle figures {' '.join(pictured)} -o figures"]
 
 
-def run(out: Path, line: str) -> None:
-    """Print a command line and run it in the folder of results; its output goes to log.txt
-    there.
+class Evaluations(NamedTuple):
+    """Command lines of evaluations, and the folders of their results."""
+
+    lines: list[str]  # in any order
+    timed_lines: list[str]  # of benchmarks, which need the machine for themselves
+    measured: list[str]  # for tables
+    pictured: list[str]  # for figures
+
+
+def evaluation_commands(features: Path | None) -> Evaluations:
+    """The command lines that evaluate all sets, with and without the stand-in of SHARP.
+
+    Args:
+        features: weights of the network behind the perceptual distance; None: those that `spackle
+            weights get squeezenet` has downloaded, and without them there is no distance.
     """
-    print(f"$ {line}", flush=True)
-    began, words = time.monotonic(), shlex.split(line)
-    with (out / "log.txt").open("a") as log:
+    near_view = "--protocol near-view"
+    if features is not None:
+        near_view += f" --features {shlex.quote(str(features))}"
+    evaluations = Evaluations([], [], [], [])
+    for one in SETS:
+        words = f"data/{one.name} --dataset {one.layout} --base {one.base}"
+        # A scene gives one photo to complete; the others are compared with.
+        limit = "" if one.name == "photos" else " --limit 1"
+        methods = "--methods base,paper-initial,paper,spackle"
+        _add(evaluations, f"evaluate {words}{limit} {methods} --side {SIDE}", f"{one.name}-large")
+        if one.has_second_photos:
+            near = f"{near_view} {methods},dense --side {SIDE}"
+            _add(evaluations, f"evaluate {words}{limit} {near}", f"{one.name}-near")
+        if one.in_figure:
+            figure = f"--disparity 0.6 {methods}"
+            _add(evaluations, f"evaluate {words}{limit} {figure}", f"{one.name}-figure")
+
+    stand_in = (
+        "--base sharp -c sharp_stand_in.safetensors --residual residual/best.safetensors "
+        "--direct-ft direct-ft/best.safetensors"
+    )
+    for one in SETS:
+        if one.name not in STAND_IN_SETS:
+            continue
+        words = f"data/{one.name} --dataset {one.layout} {stand_in} --limit 1"
+        methods = f"--methods base,paper-initial,paper,direct-ft --side {SIDE}"
+        _add(evaluations, f"evaluate {words} {methods}", f"{one.name}-stand-in-large")
+        near = f"{near_view} {methods}"
+        _add(evaluations, f"evaluate {words} {near}", f"{one.name}-stand-in-near")
+        figure = f"--disparity 0.6 {methods}"
+        _add(evaluations, f"evaluate {words} {figure}", f"{one.name}-stand-in-figure")
+
+    # Times of the paper's method with a base that has a network, and with one that has none.
+    for one in SETS[:2]:
+        folder = f"runs/{one.name}-bench"
+        words = f"data/{one.name} --dataset {one.layout} --base {one.base} --limit 1"
+        evaluations.timed_lines.append(f"spackle bench {words} --side {SIDE} --runs 1 -o {folder}")
+        evaluations.measured.append(folder)
+    return evaluations
+
+
+def _add(evaluations: Evaluations, words: str, name: str) -> None:
+    """Add a command line whose results go to runs/NAME, for tables or, by the name, for figures."""
+    folder = f"runs/{name}"
+    evaluations.lines.append(f"spackle {words} -o {folder}")
+    folders = evaluations.pictured if name.endswith("-figure") else evaluations.measured
+    folders.append(folder)
+
+
+def commands(features: Path | None) -> list[list[str]]:
+    """All command lines in groups; those of a group do not depend on each other.
+
+    Args:
+        features: as in `evaluation_commands`.
+    """
+    evaluations = evaluation_commands(features)
+    joined = [
+        f"spackle tables {' '.join(evaluations.measured)} -o tables --html",
+        f"spackle figures {' '.join(evaluations.pictured)} -o figures --rows 8",
+    ]
+    alone = [*training_commands()]
+    timed = evaluations.timed_lines
+    return [*([line] for line in alone), evaluations.lines, *([line] for line in timed), joined]
+
+
+# --- running
+
+
+class Runner:
+    """Runs command lines in the folder of results; each has its output in a file of log/."""
+
+    def __init__(self, folder: Path) -> None:
+        """Use this folder, which exists."""
+        self.folder = folder
+        self.logs = folder / "log"
+        self.logs.mkdir()
+        self.count = 0
+        self.lock = threading.Lock()
+
+    def run_group(self, lines: Sequence[str]) -> None:
+        """Run lines, two at a time; exit if one fails."""
+        workers = min(AT_ONCE, len(lines))
+        with ThreadPoolExecutor(workers) as pool:
+            # A process that shares the machine has one core.
+            threads = max(1, (os.cpu_count() or 1) // workers)
+            failures = [
+                log for log in pool.map(lambda line: self._run(line, threads), lines) if log
+            ]
+        if failures:
+            sys.exit(f"a command failed: {', '.join(map(str, failures))} says why")
+
+    def _run(self, line: str, threads: int) -> Path | None:
+        """Run a line with so many threads, and print it; returns its log if it failed."""
+        with self.lock:
+            self.count += 1
+            log = self.logs / f"{self.count:02d}.txt"
+        words = shlex.split(line)
         programs = Path(sys.executable).parent
-        # torchrun starts spackle
-        environment = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
-        command = [programs / words[0], *words[1:]]
-        if subprocess.run(command, cwd=out, stdout=log, stderr=log, env=environment).returncode:
-            sys.exit(f"this command failed: {out / 'log.txt'} says why")
-    print(f"  {time.monotonic() - began:.0f} s", flush=True)
+        # torchrun starts spackle, so the programs have to be on the path.
+        environment = os.environ | {
+            "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}",
+            "OMP_NUM_THREADS": str(threads),
+            "NUMBA_NUM_THREADS": str(threads),
+        }
+        began = time.monotonic()
+        with log.open("w") as file:
+            done = subprocess.run(
+                [programs / words[0], *words[1:]],
+                cwd=self.folder,
+                stdout=file,
+                stderr=file,
+                env=environment,
+            )
+        print(f"$ {line}\n  {time.monotonic() - began:.0f} s", flush=True)
+        return log if done.returncode else None
 
 
 def main() -> None:
-    """Make the data and the weights, and run all commands."""
+    """Make the data and the stand-in, and run all commands."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("reproduction"), help="a folder, which is new"
     )
-    out, began = parser.parse_args().output.absolute(), time.monotonic()
+    parser.add_argument(
+        "--features",
+        type=Path,
+        metavar="FILE",
+        help="SqueezeNet's weights for the perceptual distance, if not downloaded",
+    )
+    arguments = parser.parse_args()
+    out = arguments.output.absolute()
+    features = None if arguments.features is None else arguments.features.absolute()
+    began = time.monotonic()
     if out.exists():
         parser.error(f"{out}: is there already: give another folder with -o")
-    make_data(out / "data", out / "photos")
-    save_file(deterministic_weights(expected_shapes(MICRO_SIZE)), out / "random.safetensors")
-    fit_sharp(out / "random.safetensors", out / "sharp.safetensors")
-    for line in commands():
-        run(out, line)
+
+    make_data(out / "data", out / "training_photos")
+    photos = [
+        torch.from_numpy(photo(name, TRAINING_SIDE) / 255).float() for name in TRAINING_PHOTOS
+    ]
+    write_stand_in(out / "sharp_stand_in.safetensors", photos)
+    runner = Runner(out)
+    for lines in commands(features):
+        runner.run_group(lines)
+    claims = claims_of_folder(out)
+    (out / CLAIMS_FILE).write_text(claims, encoding="utf-8")
+    print(claims)
     print(
-        f"{time.monotonic() - began:.0f} s: tables and report.html in {out / 'tables'}, figures in "
-        f"{out / 'figures'}"
+        f"{time.monotonic() - began:.0f} s, {cpu_seconds():.0f} of the processor: tables and "
+        f"report.html in {out / 'tables'}, figures in {out / 'figures'}"
     )
+
+
+def cpu_seconds() -> float:
+    """Seconds that this process and its finished children have kept a core busy."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ from PIL import Image
 
 from spackle.paper.evaluation.folder import image_file
 from spackle.paper.evaluation.measurements import Run as Results
-from spackle.paper.evaluation.report import make_report
+from spackle.paper.evaluation.plots import plots_of_run
+from spackle.paper.evaluation.report import make_report, overview_table
 from spackle.paper.evaluation.tables import make_tables
 
 pytest.importorskip("matplotlib")
@@ -116,6 +117,31 @@ def test_a_page_is_well_formed_and_contains_everything(tmp_path: Path) -> None:
         assert table.caption in page.text("figcaption")
         assert all(note in page.text("li") for note in table.notes)
     assert page.text("strong")  # the best of a column
+
+
+def test_the_legend_of_a_plot_with_one_scene_is_below_its_axes() -> None:
+    measured = {"psnr_hole": 12.0, "distance": 3.0}
+    methods = ("base", "paper-initial", "paper", "spackle", "dense")
+    run = evaluation_data.results("One scene", True, lambda k: dict.fromkeys(methods, measured), 1)
+    plots = plots_of_run(run)
+    assert len(plots) == 2
+    for plot in plots:
+        drawing = ElementTree.fromstring(base64.b64decode(plot.address.partition(",")[2]))
+        parts = {part.get("id"): part for part in drawing.iter()}
+        corners = re.findall(r"[ML] \S+ (\S+)", str(parts["patch_2"][0].get("d")))
+        legend = [float(str(text.get("y"))) for text in parts["legend_1"].iter() if text.get("y")]
+        assert len(legend) == 2 * len(methods)  # markers and titles
+        numbers = 20  # units of the image below the axes, for the numbers along them
+        assert min(legend) > max(map(float, corners)) + numbers
+
+
+def test_a_table_without_a_column_says_only_how_to_get_its_metrics(tmp_path: Path) -> None:
+    run = evaluation_data.results("Scenes", False, lambda k: {"base": {"har": 0.1}}, 1)
+    run.about["metrics"].update(dict.fromkeys(("clipiqa", "niqe", "musiq"), "not run: no pyiqa"))
+    (table,) = [table for table in make_tables([run]) if table.label == "tab:large_view_nr_iqa"]
+    assert table.notes == ["CLIPIQA, NIQE, MUSIQ not run: no pyiqa."]
+    # The overview, which leaves these columns out, says it, too.
+    assert table.notes[0] in overview_table([run]).notes
 
 
 def test_evaluate_and_tables_write_the_report(

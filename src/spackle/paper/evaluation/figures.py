@@ -64,8 +64,9 @@ COMPARISON = PaperFigure(
     preferred_method="spackle",
     caption=(
         "Qualitative comparison under large viewpoint changes ({views}). From left to right: the "
-        "input image, the view rendered from {bases} with holes in red boxes, and the view by "
-        "{methods}. The tag is the number of added Gaussians in percent of the base's. {weights}"
+        "input image, the view rendered from the base ({bases}) with holes in red boxes, and the "
+        "views by: {methods}. The tag is the number of added Gaussians in percent of the base's. "
+        "{weights}"
     ),
 )
 
@@ -75,11 +76,12 @@ DIRECT_FINE_TUNING = PaperFigure(
     needed_method="direct-ft",
     caption=(
         "Generated supervision applied directly to the base ({views}). From left to right: the "
-        "input image, the view rendered from {bases}, the view by {methods}, by the naive "
-        "decoupled framework (direct FT), and the occluded regions (white). {weights}"
+        "input image, the view rendered from the base ({bases}), the view by {methods}, by the "
+        "naive decoupled framework (direct FT), and the occluded regions (white). {weights}"
     ),
 )
 
+OWN_METHODS = ("paper-initial", "paper", "spackle")  # a caption names those that are shown
 FIGURES = (COMPARISON, DIRECT_FINE_TUNING)
 # Titles of columns where they differ from the method's: short, because columns are narrow.
 COLUMN_TITLES = {
@@ -228,8 +230,8 @@ def _draw_figure(
     )
 
     # The caption says which of our own methods the figure shows.
-    spackle_titles = [METHODS[name].title for name in columns if name in ("paper", "spackle")]
-    latex = _figure_latex(figure, [run for run, _ in runs], bases, " and by ".join(spackle_titles))
+    own_titles = [METHODS[name].title for name in columns if name in OWN_METHODS]
+    latex = _figure_latex(figure, [run for run, _ in runs], bases, "; ".join(own_titles))
     return DrawnFigure(picture, latex)
 
 

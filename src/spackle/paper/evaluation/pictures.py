@@ -67,6 +67,9 @@ class GridRow(NamedTuple):
     pictures: Sequence[GridPicture]
 
 
+TAG_SCALE = 0.7  # height of a tag's letters over that of the titles'
+
+
 def draw_grid(
     titles: Sequence[str],
     rows: Sequence[GridRow],
@@ -140,7 +143,7 @@ def _draw_row(
         resized_pictures: the same pictures in the size in which they are drawn.
         y: where the row begins, in pixels from the top.
         gap: between pictures, in pixels.
-        font_size: height of a tag's letters, in pixels.
+        font_size: height of the titles' letters, in pixels.
     """
     draw = ImageDraw.Draw(canvas)
     box_line_width = max(2, font_size // 10)
@@ -149,7 +152,9 @@ def _draw_row(
         canvas.paste(resized, (x, y))
         _draw_boxes(draw, grid_picture.boxes, (x, y), resized.size, box_line_width)
         if grid_picture.tag:
-            _draw_tag(draw, grid_picture.tag, (x + resized.width, y), gap, font_size)
+            # Smaller than the titles, because a tag covers a part of the picture.
+            tag_size = round(TAG_SCALE * font_size)
+            _draw_tag(draw, grid_picture.tag, (x + resized.width, y), gap // 2, tag_size)
         x += resized.width + gap
 
 

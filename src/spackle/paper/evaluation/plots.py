@@ -40,8 +40,10 @@ MATPLOTLIB_SETTINGS: Any = {
     "lines.markersize": 5,
 }
 PLOT_WIDTH_INCHES = 4.6  # about as wide as a phone
-PLOT_HEIGHT_INCHES = 3.4
+AXES_HEIGHT_INCHES = 2.5  # of the axes with the title above and the numbers below them
+BARE_AXES_HEIGHT_INCHES = 1.0  # the same, if the axes had no row
 SCENE_HEIGHT_INCHES = 0.21  # of a scene's row in a plot scene by scene
+LEGEND_LINE_INCHES = 0.19  # of a method's line in the legend, which is below the axes
 MAX_PLOTTED_SCENES = 30
 MAX_NAME_LETTERS = 14  # of a scene's name beside a plot
 
@@ -102,7 +104,7 @@ def _draw_plot(
     y_title: str,
     finish_axes: Callable[[Axes], object],
     note: str = "",
-    height_inches: float = PLOT_HEIGHT_INCHES,
+    axes_height_inches: float = AXES_HEIGHT_INCHES,
 ) -> Plot:
     """Draw series of points as an SVG image; the same series give the same bytes.
 
@@ -114,7 +116,7 @@ def _draw_plot(
         y_title: the title of the y axis.
         finish_axes: sets scales and ticks.
         note: a sentence below the plot.
-        height_inches: of the image.
+        axes_height_inches: of the image without its legend.
     """
     # Imported here, because matplotlib is optional.
     from matplotlib import rc_context
@@ -123,6 +125,8 @@ def _draw_plot(
     with rc_context(MATPLOTLIB_SETTINGS), warnings.catch_warnings():
         # matplotlib warns about letters without a glyph; the browser's font has these letters.
         warnings.simplefilter("ignore")
+        # The legend has a line for each method, and takes no space from the axes.
+        height_inches = axes_height_inches + LEGEND_LINE_INCHES * len(series)
         figure = Figure(figsize=(PLOT_WIDTH_INCHES, height_inches), layout="constrained")
         axes = figure.subplots()
 
@@ -295,8 +299,6 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
         note += f" {len(scenes)} of {len(ranked_scenes)} scenes, spread evenly."
 
     title, x_title = SCENE_PLOTS[metric]
-    # Axes and legend need half of a usual plot's height.
-    height_inches = PLOT_HEIGHT_INCHES / 2 + SCENE_HEIGHT_INCHES * len(scenes)
     return _draw_plot(
         title,
         run,
@@ -305,7 +307,7 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
         y_title="",  # the rows' names say what they are
         finish_axes=finish_axes,
         note=note,
-        height_inches=height_inches,
+        axes_height_inches=BARE_AXES_HEIGHT_INCHES + SCENE_HEIGHT_INCHES * len(scenes),
     )
 
 

@@ -45,7 +45,7 @@ from spackle.paper.evaluation.table import (
     group_widths,
 )
 from spackle.paper.evaluation.table_numbers import Column, texts_of_methods
-from spackle.paper.evaluation.table_texts import overview_notes
+from spackle.paper.evaluation.table_texts import method_row_name, overview_notes
 from spackle.paper.evaluation.tables import make_tables, prepend_group_name
 
 REPORT_FILE = "report.html"  # the page, and in this package its template
@@ -233,7 +233,7 @@ def overview_table(runs: Sequence[Run]) -> Table:
         methods = list(dict.fromkeys(method for run in group_runs for method in run.methods))
         measurements = [measurement for run in group_runs for measurement in run.measurements]
         rows = texts_of_methods(measurements, columns, methods)
-        names = [picture_title(group_runs[0], method) for method in methods]
+        names = [method_row_name(group_runs[0], method) for method in methods]
         groups.append((f"{title}, base {base}", names, rows))
 
     # Only columns in which any row has a number.

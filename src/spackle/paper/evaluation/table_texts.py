@@ -137,6 +137,13 @@ def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
     left_out = {metric_of_column(column.metric) for column in missing_columns(layout, runs)}
     shown_metrics = [metric for metric in image_metrics if metric not in left_out]
 
+    # A table without a column has nothing to explain, but says how to get its metrics.
+    if len(left_out) == len(layout.columns):
+        missing_notes = [
+            note for run in runs for note in _missing_metrics_notes(run, image_metrics)
+        ]
+        return list(dict.fromkeys(missing_notes))
+
     notes = [f"{run.title}: {run.about_scenes}." for run in runs if run.about_scenes]
     notes += [_views_note(run) for run in runs]
     notes += [f"Base {run.base_title}: {run.base_description}." for run in runs]
@@ -155,12 +162,15 @@ def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
 
 
 def overview_notes(runs: Sequence[Run]) -> list[str]:
-    """Notes below an overview of evaluations: scenes, bases, methods and weights."""
+    """Notes below an overview of evaluations: scenes, bases, methods, weights, missing metrics."""
     notes = [f"{run.title}: {run.about_scenes}." for run in runs if run.about_scenes]
     notes += [f"Base {run.base_title}: {run.base_description}." for run in runs]
     descriptions = [describe_method(method) for run in runs for method in run.methods]
     notes += [f"{description.title}: {description.summary}." for description in descriptions]
     notes += [_residual_note(run) for run in runs]
+    for run in runs:
+        asked_metrics = [name for name in METRICS if name in run.about.get("metrics", {})]
+        notes += _missing_metrics_notes(run, asked_metrics)
     return list(dict.fromkeys(notes))
 
 
