@@ -19,6 +19,7 @@ os.environ["SPACKLE_WEIGHTS"] = str(Path(__file__).with_name("no weights"))
 # run, so that no process is left alone with a long one at the end.
 JOURNEYS = (
     "test_quick_start.py",
+    "test_rendered_scenes.py",
     "web",
     "cli",
     "fuzz",
