@@ -83,10 +83,14 @@ def claims(large_runs: Sequence[Run], fine_tuned_runs: Sequence[Run]) -> str:
 
 
 def claims_of_folder(folder: Path) -> str:
-    """The claims by the evaluations in the folder of `benchmarks/reproduce.py`."""
-    runs = [load_run(path) for path in sorted((folder / "runs").glob("*-large"))]
+    """The claims by the evaluations in the folder of `benchmarks/reproduce.py`.
+
+    The bases that need no weights come first, then the stand-in of SHARP.
+    """
+    large = [load_run(path) for path in sorted((folder / "runs").glob("*-large"))]
     near = [load_run(path) for path in sorted((folder / "runs").glob("*-near"))]
-    return claims(runs, [run for run in near if "direct-ft" in run.methods])
+    large.sort(key=lambda run: "direct-ft" in run.methods)
+    return claims(large, [run for run in near if "direct-ft" in run.methods])
 
 
 if __name__ == "__main__":

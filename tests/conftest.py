@@ -19,7 +19,6 @@ os.environ["SPACKLE_WEIGHTS"] = str(Path(__file__).with_name("no weights"))
 # run, so that no process is left alone with a long one at the end.
 JOURNEYS = (
     "test_quick_start.py",
-    "test_rendered_scenes.py",
     "web",
     "cli",
     "fuzz",
@@ -38,6 +37,7 @@ JOURNEYS = (
     "bases/test_moge.py",
     "bases/test_lite.py",
     "render/test_kernels.py",
+    "test_rendered_scenes.py",
     "paper/evaluation/test_figures.py",
     "paper/evaluation/test_pairs.py",
     "paper/evaluation/test_report_html.py",
