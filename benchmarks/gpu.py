@@ -184,9 +184,9 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
         )[0][0]
         here = (radii > 0).all(-1).cpu()
         lens = KernelCamera.of(camera, 0.0, near)
-        there = torch.from_numpy(
-            project([scene], lens, tiles_to_draw(lens, None))[0].boxes[: len(scene), 1] > 0
-        )
+        # The column after a Gaussian's last tile is 0 if it is not drawn.
+        boxes = project([scene], lens, tiles_to_draw(lens, None)).boxes
+        there = torch.from_numpy(boxes[:, 1] > 0)
         yield (
             f"{len(scene):,} Gaussians: {float((apart < CLOSE).float().mean()):.4%} of pixels "
             f"within {CLOSE:g}, worst "

@@ -29,16 +29,21 @@ from spackle.render.protocol import (
 from spackle.runtime.device import parallel_for_chunks
 
 Array = npt.NDArray[Any]
-Arrays = tuple[Array, ...]  # a scene's five tensors
+Arrays = tuple[Array, ...]  # means, quats, scales, opacities and colours of a scene
 
 
 def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: None) -> Tensor:
-    """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in
-    ours.
+    """[H, W, 3] sRGB of Gaussians without harmonics, with `eps2d` 0.
+
+    Depth and alpha are computed too, as in ours. `lap` is called with the name of each step when it
+    ends.
     """
-    tensors = tuple(t.numpy() for t in scene.tensors)
+    tensors = tuple(tensor.numpy() for tensor in scene.tensors)
     view = KernelCamera.of(camera, 0.0, near_plane([scene], camera))
-    splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
+    # Of each Gaussian: the centre's u and v, depth, and the inverse covariance; and its pixels'
+    # left, right, top and bottom, which stay 0 if it is not drawn.
+    splats = np.empty((len(scene), 6), np.float32)
+    boxes = np.zeros((len(scene), 4), np.int32)
     parallel_for_chunks(
         lambda a, b: naive_project(a, b, tensors, view, splats, boxes),
         len(scene),
@@ -67,8 +72,10 @@ def naive_project(
     first..last.
     """
     means, quats, scales, opacities, _ = scene
-    lens, pose, width, height, _ = view
+    lens = view.lens  # fx, fy, cx, cy, ...
+    pose = view.pose
     for i in range(first, last):
+        # The centre in the camera's frame.
         x, y, z = (
             pose[:, 0] * means[i, 0]
             + pose[:, 1] * means[i, 1]
@@ -83,13 +90,22 @@ def naive_project(
         )
         if det <= 0:
             continue
-        u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-        splats[i, 0], splats[i, 1] = u, v
-        splats[i, 3], splats[i, 4], splats[i, 5] = yy / det, -xy / det, xx / det
-        reach = 2 * math.log(opacities[i] / ALPHA_MIN)
-        rx, ry = math.sqrt(reach * xx), math.sqrt(reach * yy)
-        boxes[i, 0], boxes[i, 1] = max(0, math.floor(u - rx)), min(width, math.floor(u + rx) + 1)
-        boxes[i, 2], boxes[i, 3] = max(0, math.floor(v - ry)), min(height, math.floor(v + ry) + 1)
+        u = lens[0] * x / z + lens[2]
+        v = lens[1] * y / z + lens[3]
+        splats[i, 0] = u
+        splats[i, 1] = v
+        splats[i, 3] = yy / det
+        splats[i, 4] = -xy / det
+        splats[i, 5] = xx / det
+
+        # The box in which alpha is at least ALPHA_MIN.
+        reach = 2 * math.log(opacities[i] / ALPHA_MIN)  # squared Mahalanobis distance
+        half_width = math.sqrt(reach * xx)
+        half_height = math.sqrt(reach * yy)
+        boxes[i, 0] = max(0, math.floor(u - half_width))
+        boxes[i, 1] = min(view.width, math.floor(u + half_width) + 1)
+        boxes[i, 2] = max(0, math.floor(v - half_height))
+        boxes[i, 3] = min(view.height, math.floor(v + half_height) + 1)
 
 
 @numba.njit(nogil=True, cache=True)

@@ -276,10 +276,9 @@ def added_ratios(clock: Mapping[str, list[float]], name: str) -> RunValues:
 
     `clock` has the seconds of each task and stage, by "task/stage".
     """
-    base = sum(np.array(clock[f"{BASE}/{stage}"]) for stage in BASE_STAGES)
-    added = sum(np.array(clock[f"{name}/{stage}"]) for stage in COMPLETION_STAGES)
-    ratios: RunValues = added / base
-    return ratios
+    base: RunValues = np.sum([clock[f"{BASE}/{stage}"] for stage in BASE_STAGES], axis=0)
+    added: RunValues = np.sum([clock[f"{name}/{stage}"] for stage in COMPLETION_STAGES], axis=0)
+    return added / base
 
 
 def table(cases: Mapping[str, tuple[str, View]], facts: Mapping[str, Any]) -> str:

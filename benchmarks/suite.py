@@ -276,8 +276,16 @@ def video_section(
 def sharp_section(
     runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device: torch.device = CPU
 ) -> Section:
-    """Time a photo to a scene on disk by SHARP, by stage; the time does not depend on the photo's
-    content.
+    """Time a photo to a scene on disk by SHARP, by stage.
+
+    The time does not depend on the photo's content.
+
+    Args:
+        runs: number of timed runs.
+        base: SHARP, on `device`.
+        photo: any photo.
+        peaks: operations and bytes that the machine does in a millisecond, from `limits_section`.
+        device: where it runs.
     """
     count = 0
 
@@ -292,16 +300,14 @@ def sharp_section(
             save_ply(gaussians, Path(folder) / "scene.ply", camera=photo.camera)
         lap(SAVE)
 
-    # Counting operations also warms up. A compiled network hides its operations, and is warmed up
-    # by `time_tasks`.
-    flops = 0.0 if base.compiled else count_flops(lambda: whole(lambda name: None))
-    times = time_tasks(runs, {"": whole}, device, warm=flops > 0)
-    least = flops / peaks[PRODUCT.format(base.precision)] if flops else None
+    flops = count_flops(lambda: whole(lambda name: None))
+    times = time_tasks(runs, {"": whole}, device, warm=True)  # counting has warmed up
+    least = flops / peaks[PRODUCT.format(base.precision)]
     figures = [Timed(FORWARD, times["", FORWARD], limit_ms=least)]
     figures += [Timed(name, times["", name]) for name in (UNPROJECT, SAVE)]
     figures.append(Timed("photo to scene", times["", TOTAL_STAGE]))
     facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
-    facts |= {"windows": base.windows_per_batch, "compiled": base.compiled}
+    facts |= {"windows": base.windows_per_batch}
     return figures, {**facts, "gaussians": count}
 
 
@@ -328,13 +334,12 @@ def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
         if options.checkpoint is None:
             raise InputError("no weights: name them by -c FILE")
         photo = Photo(torch.rand(SIDE, SIDE, 3), 1.2 * SIDE, FocalSource.DATASET, Path("photo.png"))
-        speed = {
-            "windows_per_batch": options.windows,
-            "compiled": options.compile,
-            "precision": options.precision,
-        }
         settings = BaseSettings(
-            name="sharp", checkpoint=options.checkpoint, device=device.type, **speed
+            name="sharp",
+            checkpoint=options.checkpoint,
+            device=device.type,
+            windows_per_batch=options.windows,
+            precision=options.precision,
         )
         base = open_base(settings).load(photo)
         assert isinstance(base, SharpBase)
@@ -390,7 +395,6 @@ def main(arguments: list[str]) -> None:
         "--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of SHARP"
     )
     parser.add_argument("--windows", type=int, help="of SHARP, at once")
-    parser.add_argument("--compile", action="store_true", help="compile SHARP by torch.compile")
     options = parser.parse_args(arguments)
     chosen = ["limits", *(name for name in options.only.split(",") if name != "limits")]
     try:

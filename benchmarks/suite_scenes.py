@@ -20,12 +20,9 @@ from spackle.runtime.errors import InputError
 
 SIDE = 1536  # pixels a side, as in SHARP
 CELL = 2
-# share of a view; steps and relative tolerance of the search
-HOLES, HALVINGS, CLOSE = (
-    0.05,
-    14,
-    0.01,
-)
+HOLES = 0.05  # share of a view
+HALVINGS = 14  # of the range in which `find_view` searches
+CLOSE = 0.01  # relative tolerance of the share that it finds
 # Boxes in front of the wall: left, top, right, bottom as fractions of the image, and depth in
 # metres. They cover less than a tenth of it, so that camera paths look at the wall.
 BOXES = (
@@ -47,17 +44,16 @@ def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
     """
     generator = torch.Generator().manual_seed(0)
     camera, uv, xs, ys, grid = _pixels(side)
-    layers, n = [], grid * grid
+    n = grid * grid
+    layers = []
     for layer in range(2):
         waves = 1.5 * torch.sin(9 * xs / grid) * torch.cos(7 * ys / grid)
         z = 3 + 2 * layer + waves + 0.05 * torch.rand(grid, grid, generator=generator)
         scales = (
             (0.6 + 0.8 * torch.rand(n, 3, generator=generator)) * z.reshape(n, 1) / camera.focal[0]
         )
-        quats, opacities = (
-            torch.randn(n, 4, generator=generator),
-            0.04 + 0.95 * torch.rand(n, generator=generator),
-        )
+        quats = torch.randn(n, 4, generator=generator)
+        opacities = 0.04 + 0.95 * torch.rand(n, generator=generator)
         colors = torch.rand(n, 3, generator=generator)
         layers.append(
             Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, opacities, colors)
@@ -66,33 +62,35 @@ def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
 
 
 def holed_scene(side: int = SIDE, height: int | None = None) -> tuple[Gaussians, Camera]:
-    """A scene of the same size, with holes only in views from the side: boxes in front of a
-    wall.
+    """Boxes in front of a wall, as two layers of (side/2)² Gaussians, and the photo's camera.
+
+    Only views from the side have holes.
 
     `side` is the photo's width in pixels; `height`, by default the same, is its height. As in
     SHARP, the grid of Gaussians is square whatever the photo's shape is.
     """
     camera, uv, xs, ys, grid = _pixels(side, height)
-    n, depth = grid * grid, torch.full((grid, grid), WALL_M)
+    n = grid * grid
+    depth = torch.full((grid, grid), WALL_M)
     for left, top, right, bottom, metres in BOXES:
-        depth[int(top * grid) : int(bottom * grid), int(left * grid) : int(right * grid)] = metres
+        rows = slice(int(top * grid), int(bottom * grid))
+        columns = slice(int(left * grid), int(right * grid))
+        depth[rows, columns] = metres
+
+    # Colours vary in waves, of another length for red, green and blue.
     hues = (0.4, 0.45, 0.55)
     waves = [
         0.5 + hue * torch.sin(20 * k * xs / grid + 3 * depth + k * ys / 9) / 2
         for k, hue in enumerate(hues, 1)
     ]
-    quats, colors = (
-        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        torch.stack(waves, dim=-1).reshape(n, 3),
-    )
+    colors = torch.stack(waves, dim=-1).reshape(n, 3)
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+    opacities = torch.full((n,), 0.99)
     layers = []
     for z in (depth, BEHIND * depth):
         scales = (SPREAD_PX * z.reshape(n, 1) / camera.focal[0]).expand(n, 3).contiguous()
-        layers.append(
-            Gaussians(
-                camera.unproject(uv, z).reshape(n, 3), quats, scales, torch.full((n,), 0.99), colors
-            )
-        )
+        means = camera.unproject(uv, z).reshape(n, 3)
+        layers.append(Gaussians(means, quats, scales, opacities, colors))
     return Gaussians.cat(layers), camera
 
 
@@ -111,20 +109,26 @@ def _pixels(side: int, height: int | None = None) -> tuple[Camera, Tensor, Tenso
 def find_view(
     base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES
 ) -> tuple[float, Camera]:
-    """Find by bisection the disparity at which the right view has this share of holes; returns it
-    and the view.
+    """The disparity at which the right view has this share of holes, and the view.
+
+    It is found by bisection, because holes grow with the disparity.
 
     Raises:
         InputError: there is no such view.
     """
-    even, depths = camera.even(), DepthRange.of(base, is_metric=True)
-    low, high = 0.0, MAX_DISPARITY
+    even_camera = camera.even()
+    depths = DepthRange.of(base, is_metric=True)
+    low = 0.0
+    high = MAX_DISPARITY
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        view = leftmost_and_rightmost(even, middle, depths)[1]
-        found = hole_area_ratio(renderer.render(base, view).alpha)
-        low, high = (middle, high) if found < share else (low, middle)
-        if abs(found / share - 1) < CLOSE:
+        _, view = leftmost_and_rightmost(even_camera, middle, depths)
+        hole_ratio = hole_area_ratio(renderer.render(base, view).alpha)
+        if hole_ratio < share:
+            low = middle
+        else:
+            high = middle
+        if abs(hole_ratio / share - 1) < CLOSE:
             return middle, view
     raise InputError(f"no view up to disparity {MAX_DISPARITY:g} has {share:.0%} holes")
 

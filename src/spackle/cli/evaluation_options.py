@@ -28,7 +28,7 @@ FolderArgument = Annotated[
     Path, typer.Argument(metavar="FOLDER", help="Folder of the unpacked dataset.")
 ]
 BaseNameOption = Annotated[
-    str, typer.Option(metavar="NAME", help=f"Base: {DATASET_BASES}, here the dataset's own.")
+    str, typer.Option(metavar="NAME", help=f"Base: {DATASET_BASES} (the dataset's own).")
 ]
 BaseWeightsOption = Annotated[
     Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")

@@ -59,7 +59,10 @@ VerboseOption = Annotated[
 CheckpointOption = Annotated[
     Path | None,
     typer.Option(
-        "-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), moge or lite."
+        "-c",
+        "--checkpoint",
+        metavar="FILE",
+        help="Weights of the base: of sharp, moge or lite; with auto of sharp.",
     ),
 ]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]

@@ -57,12 +57,12 @@ class DeviceGaussians:
                 is_finite = is_finite.flatten(1).all(1)  # [N]
             finite_by_field.append(is_finite)
         finite = torch.stack(finite_by_field).all(0)
-        cleaned = Gaussians(
-            *(
-                torch.where(finite.reshape(-1, *[1] * (field.ndim - 1)), field, 0)
-                for field in fields
-            )
-        )
+        cleaned_fields = []
+        for field in fields:
+            further_axes = [1] * (field.ndim - 1)  # so that `finite` holds for all of a Gaussian
+            is_kept = finite.reshape(-1, *further_axes)  # [N], [N, 1] or [N, 1, 1]
+            cleaned_fields.append(torch.where(is_kept, field, 0))
+        cleaned = Gaussians(*cleaned_fields)
         return DeviceGaussians(
             means=cleaned.means,
             covariances=upper_covariances(cleaned),

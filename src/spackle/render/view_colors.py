@@ -50,13 +50,22 @@ BLOCK_GAUSSIANS = 256  # their changes of colour fit into the first-level cache
 MAX_CHANGE = 1e30  # a larger sum of harmonics is treated like NaN
 
 # Numbers of the formulas in float32, for the kernel.
-K_OFFSET, K_POWER, K_ROOT = np.float32(OFFSET), np.float32(EXPONENT), np.float32(1 / EXPONENT)
+K_OFFSET = np.float32(OFFSET)
+K_POWER = np.float32(EXPONENT)
+K_ROOT = np.float32(1 / EXPONENT)
 K_MAX = np.float32(MAX_CHANGE)
 K_1 = np.float32(C1)
-K_2_MIXED, K_2_AXIAL, K_2_SQUARES = (np.float32(c) for c in (C2_MIXED, C2_AXIAL, C2_SQUARES))
-K_3_OUTER, K_3_MIXED, K_3_INNER = (np.float32(c) for c in (C3_OUTER, C3_MIXED, C3_INNER))
-K_3_AXIAL, K_3_SQUARES = (np.float32(c) for c in (C3_AXIAL, C3_SQUARES))
-TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
+K_2_MIXED = np.float32(C2_MIXED)
+K_2_AXIAL = np.float32(C2_AXIAL)
+K_2_SQUARES = np.float32(C2_SQUARES)
+K_3_OUTER = np.float32(C3_OUTER)
+K_3_MIXED = np.float32(C3_MIXED)
+K_3_INNER = np.float32(C3_INNER)
+K_3_AXIAL = np.float32(C3_AXIAL)
+K_3_SQUARES = np.float32(C3_SQUARES)
+TWO = np.float32(2)
+THREE = np.float32(3)
+FOUR = np.float32(4)
 
 
 def as_seen(gaussians: Gaussians, camera: Camera) -> Gaussians:
@@ -112,17 +121,22 @@ class SeenColors(torch.autograd.Function):
         `gradient` is that of the colours [N, 3]. The position has none.
         """
         *fields, position = ctx.saved_tensors
-        needs = ctx.needs_input_grad[:3]
+        needed_indices = [index for index in range(3) if ctx.needs_input_grad[index]]
         with torch.enable_grad():
             inputs = [
-                field.detach().requires_grad_(need)
-                for field, need in zip(fields, needs, strict=True)
+                field.detach().requires_grad_(index in needed_indices)
+                for index, field in enumerate(fields)
             ]
-            needed = [tensor for tensor in inputs if tensor.requires_grad]
             means, colors, harmonics = inputs
             seen = view_colors(means, colors, harmonics, position)
-            gradients = iter(torch.autograd.grad(seen, needed, gradient))
-        return *(next(gradients) if need else None for need in needs), None
+            needed_inputs = [inputs[index] for index in needed_indices]
+            needed_gradients = torch.autograd.grad(seen, needed_inputs, gradient)
+
+        # One for each argument of `forward`; None for those that need none.
+        gradients: list[Tensor | None] = [None, None, None, None]
+        for index, needed_gradient in zip(needed_indices, needed_gradients, strict=True):
+            gradients[index] = needed_gradient
+        return tuple(gradients)
 
 
 def _colors_by_kernel(means: Tensor, colors: Tensor, harmonics: Tensor, position: Tensor) -> Tensor:
@@ -155,6 +169,7 @@ def color_gaussians(
     for begin in range(start, stop, BLOCK_GAUSSIANS):
         end = min(begin + BLOCK_GAUSSIANS, stop)
         write_changes(means[begin:end], harmonics[begin:end], place, changes)
+        # Nearly all blocks have ordinary colours alone, for which there is a faster loop.
         flat_colors = colors[begin:end].reshape(-1)
         flat_result = result[begin:end].reshape(-1)
         if not write_ordinary_colors(flat_colors, changes, flat_result):
@@ -220,10 +235,10 @@ def write_harmonics(x: np.float32, y: np.float32, z: np.float32, count: int, val
 
 @kernel
 def write_ordinary_colors(colors: Any, changes: Any, result: Any) -> bool:
-    """Write changed colours, flat [3·n]; whether all are ordinary, within 0..1 before and after.
+    """Write changed colours, flat [3·n]; returns whether all are ordinary.
 
-    Those that are not ordinary are wrong, or are 0 where they would be below 0. The loop runs in
-    vector registers.
+    A colour is ordinary if it is within 0..1 before the change, and at most 1 after it; below 0 it
+    becomes 0. What is written of others is wrong. The loop runs in vector registers.
     """
     outside = 0
     for j in range(len(colors)):
