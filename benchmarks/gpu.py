@@ -163,12 +163,17 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
     """with eps2d 0 nearly all pixels are within 2e-4 of the CPU's, and hardly any Gaussian is drawn
     by one alone
     """
-    gpu, (scene, cameras) = renderer(), views()
+    gpu = renderer()
+    scene, cameras = views()
     for camera in cameras:
-        one, other = gpu.render(scene, camera), CpuRenderer().render(scene, camera)
-        apart = (one.rgb - other.rgb).abs().amax(-1)
+        by_gpu = gpu.render(scene, camera)
+        by_cpu = CpuRenderer().render(scene, camera)
+        difference = (by_gpu.rgb - by_cpu.rgb).abs().amax(-1)  # [H, W]
+
+        # Which Gaussians each of the two draws.
         near = near_plane([scene], camera)
-        material, view = DeviceGaussians.of(scene, CUDA), camera.to(CUDA)
+        material = DeviceGaussians.of(scene, CUDA)
+        view = camera.to(CUDA)
         radii = gpu._gsplat.fully_fused_projection(
             material.means,
             material.covariances,
@@ -182,17 +187,16 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
             near_plane=near,
             opacities=material.opacities,
         )[0][0]
-        here = (radii > 0).all(-1).cpu()
+        drawn_by_gpu = (radii > 0).all(-1).cpu()
         lens = KernelCamera.of(camera, 0.0, near)
         # The column after a Gaussian's last tile is 0 if it is not drawn.
         boxes = project([scene], lens, tiles_to_draw(lens, None)).boxes
-        there = torch.from_numpy(boxes[:, 1] > 0)
+        drawn_by_cpu = torch.from_numpy(boxes[:, 1] > 0)
         yield (
-            f"{len(scene):,} Gaussians: {float((apart < CLOSE).float().mean()):.4%} of pixels "
-            f"within {CLOSE:g}, worst "
-            f"{float(apart.max()):.1e}; drawn by the GPU alone {int((here & ~there).sum()):,}, by "
-            f"the processor alone "
-            f"{int((there & ~here).sum()):,}"
+            f"{len(scene):,} Gaussians: {float((difference < CLOSE).float().mean()):.4%} of pixels "
+            f"within {CLOSE:g}, worst {float(difference.max()):.1e}; "
+            f"drawn by the GPU alone {int((drawn_by_gpu & ~drawn_by_cpu).sum()):,}, "
+            f"by the processor alone {int((drawn_by_cpu & ~drawn_by_gpu).sum()):,}"
         )
 
 
@@ -237,9 +241,9 @@ def precisions(options: argparse.Namespace) -> Iterator[str]:
         base, photo = sharp(options, name)
         found[name] = to_metric(base.infer(photo), photo).means
         tasks[name] = lambda _, base=base, photo=photo: base.predict(photo)  # type: ignore[misc]
-    for name, means in found.items():
+    for precision, means in found.items():
         apart = (means - found["fp32"]).norm(dim=-1) / found["fp32"].norm(dim=-1)
-        yield f"{name}: centres {float(apart.median()):.1e} (relative median) from fp32's"
+        yield f"{precision}: centres {float(apart.median()):.1e} (relative median) from fp32's"
     yield from rows(tasks, 5)
 
 

@@ -417,24 +417,27 @@ def pictures_in(folder: Path, most: int) -> list[Path]:
 
 
 def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
-    """A row for each photo: at the left and right end of its path, the lifted photo and each run's
-    result.
+    """A picture with a row for each photo of a folder.
+
+    A row shows the left and then the right end of the photo's path: the lifted photo with its
+    holes, and the result of each run, which is the name of a mechanism that is switched off.
     """
-    base, rows = spackle.LiteBase.load(), []
+    base = spackle.LiteBase.load()
+    rows = []
     for file in pictures_in(folder, PHOTOS):
         pictures = []
         for run in runs:
             with switched_off(run, LIFT, FILL):
                 scene = spackle.predict(file, base=base, disparity=0.15, fill="exemplar")
-            sets = (
-                ([scene.base], [scene.base, scene.aux])
-                if run == DEFAULT
-                else ([scene.base, scene.aux],)
-            )
+            # The lifted photo is shown once, beside the run with all mechanisms.
+            sets = [[scene.base, scene.aux]]
+            if run == DEFAULT:
+                sets.insert(0, [scene.base])
             ends = leftmost_and_rightmost(
                 scene.camera.even(), scene.disparity or 0.0, scene.depth_range
             )
             pictures.append([[RENDERER.render(part, end).rgb for part in sets] for end in ends])
+        # From run, end, picture to end, run, picture.
         ordered = [
             picture for end in zip(*pictures, strict=True) for group in end for picture in group
         ]

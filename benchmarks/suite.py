@@ -155,19 +155,20 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
 
 
 def render_in_laps(scene: Gaussians, camera: Camera, lap: EndStage) -> None:
-    """Do what `spackle.render.drawing.draw` does, with a lap after each step."""
+    """Draw as `spackle.render.drawing.draw` does; `lap` gets each step's name at its end."""
     view = KernelCamera.of(camera, 0.0, near_plane([scene], camera))
-    wanted = tiles_to_draw(view, None)
-    splats = project([scene], view, wanted)
+    drawn_tiles = tiles_to_draw(view, None)  # all
+    splats = project([scene], view, drawn_tiles)
     lap("project")
-    lists = list_tiles(splats.boxes, wanted, GAUSSIANS_PER_CHUNK)
+    lists = list_tiles(splats.boxes, drawn_tiles, GAUSSIANS_PER_CHUNK)
     lap("bin")
-    tiles = np.flatnonzero(wanted)
+    tiles = np.flatnonzero(drawn_tiles)
     parallel_for_chunks(
         lambda a, b: sort_tiles(a, b, tiles, lists, splats.records), len(tiles), TILES_PER_CHUNK
     )
     lap("sort")
-    size = camera.height, camera.width
+    # sRGB, depth and alpha; linear colour is not kept, so it has no rows.
+    size = (camera.height, camera.width)
     images = tuple(np.zeros(shape, np.float32) for shape in ((*size, 3), size, size, (0, 0, 3)))
     parallel_for_chunks(
         lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images),
@@ -218,19 +219,28 @@ def video_section(
     frames: int = FRAMES,
     device: torch.device = CPU,
 ) -> Section:
-    """Time a photo, lifted by `lift`, to an MP4 along `rotate-forward`: as one scene, and frame by
-    frame.
+    """Time a photo to an MP4 along `rotate-forward`: as one scene, and frame by frame.
 
     Frame by frame, each frame is rendered and completed from scratch, including its occlusion
     guard; frames share only the photo's Gaussians. Lifting and encoding are the same in both ways,
-    and included in both. There are at most `VIDEO_RUNS` runs.
+    and included in both.
+
+    Args:
+        runs: number of timed runs, of which there are at most `VIDEO_RUNS`.
+        lift: makes the photo's Gaussians.
+        renderer: draws the frames.
+        network: the residual; None: the initial Gaussians alone.
+        frames: of the video.
+        device: of network and renderer.
     """
-    prediction, aux = lift(), Gaussians.empty()
+    prediction = lift()
+    aux = Gaussians.empty()
     depths = prediction.depth_range
     path = trajectory_cameras("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
     context = FillContext.of(prediction, renderer, network)
 
     def scene(lap: EndStage) -> None:
+        """From the photo to the video, with one set of Gaussians for all frames."""
         nonlocal aux
         base = lift()
         lap(LIFT)
@@ -245,6 +255,7 @@ def video_section(
         lap(ENCODE)
 
     def scratch(lap: EndStage) -> None:
+        """All frames, each with Gaussians and an occlusion guard of its own."""
         for camera in path:
             guard = context.photo_guard()
             lap(GUARDS)
@@ -252,13 +263,11 @@ def video_section(
             lap(EACH)
 
     times = time_tasks(min(runs, VIDEO_RUNS), {"scene": scene, "scratch": scratch}, device)
-    whole, each, guards = (
-        times["scene", TOTAL_STAGE],
-        times["scratch", EACH],
-        times["scratch", GUARDS],
-    )
+    whole = times["scene", TOTAL_STAGE]
+    each = times["scratch", EACH]
+    guards = times["scratch", GUARDS]
     anew = times["scene", LIFT] + each + guards + times["scene", ENCODE]
-    kept = anew - guards * (frames - 1) / frames
+    kept = anew - guards * (frames - 1) / frames  # as if one guard served all frames
     figures = [Timed(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
     figures += [Timed("one scene: photo to video", whole), Timed(EACH, each), Timed(GUARDS, guards)]
     figures.append(Timed("frame by frame: photo to video", anew))
