@@ -126,6 +126,7 @@ def test_the_legend_of_a_plot_with_one_scene_is_below_its_axes() -> None:
     plots = plots_of_run(run)
     assert len(plots) == 2
     for plot in plots:
+        assert plot.note == ""  # one scene has no order
         drawing = ElementTree.fromstring(base64.b64decode(plot.address.partition(",")[2]))
         parts = {part.get("id"): part for part in drawing.iter()}
         corners = re.findall(r"[ML] \S+ (\S+)", str(parts["patch_2"][0].get("d")))

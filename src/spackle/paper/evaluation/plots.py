@@ -294,7 +294,10 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
         axes.set_yticks(range(len(scenes)), [_shortened_name(scene) for scene in scenes])
         axes.set_ylim(len(scenes) - 0.5, -0.5)  # half a row beyond the outermost rows
 
-    note = f"In the order of {describe_method(ranking_method).title}, best first."
+    note = ""
+    # A single scene has no order.
+    if len(ranked_scenes) > 1:
+        note = f"In the order of {describe_method(ranking_method).title}, best first."
     if len(scenes) < len(ranked_scenes):
         note += f" {len(scenes)} of {len(ranked_scenes)} scenes, spread evenly."
 
