@@ -25,7 +25,8 @@ from spackle.core.color_spaces import (
 MAX_TAGS = 100  # a profile has a dozen
 SAME_LIGHT = 0.005  # curves that differ by less are rounded differently
 CURVE_SAMPLES = 256  # where two curves are compared
-_PARAMETER_COUNTS = (1, 3, 4, 5, 7)  # of the five kinds of parametric curves
+# The numbers that each of the five kinds of parametric curves has, by their names in `_parametric`.
+_PARAMETER_NAMES = ("g", "gab", "gabe", "gabcd", "gabcdef")
 Curve = tuple[Floats, Floats]  # positions in 0..1, increasing, and the light there
 
 
@@ -175,24 +176,23 @@ def _sampled_power(gamma: float) -> Curve:
 
 
 def _parametric(tag: bytes) -> Curve:
-    """The curve of a tag `para`: a power, and below a threshold a line."""
+    """The curve of a tag `para`: light is (a·x + b)^g + e where x ≥ d, else c·x + f.
+
+    The names are those of ICC's specification.
+    """
     (kind,) = struct.unpack_from(">H", tag, 8)
-    values = np.array(struct.unpack_from(f">{_PARAMETER_COUNTS[kind]}i", tag, 12)) / 65536
-    # The names are those of ICC's specification: (a·x + b)^g + e where x ≥ d, else c·x + f.
-    # Kind 0 has g alone; higher kinds have more of the numbers, and the rest follows.
-    g = values[0]
-    a = 1.0
-    b = c = d = e = f = 0.0
-    if kind >= 1:
-        a, b = values[1:3]
-        d = -b / a if a else 0.0
-    if kind == 2:
-        e = values[3]
-        f = e
-    if kind >= 3:
-        c, d = values[3:5]
-    if kind == 4:
-        e, f = values[5:7]
+    names = _PARAMETER_NAMES[kind]
+    values = np.array(struct.unpack_from(f">{len(names)}i", tag, 12)) / 65536
+    given = dict(zip(names, values.tolist(), strict=True))
+
+    # What a kind does not have follows: the line ends where the power begins, and has its offset.
+    g = given["g"]
+    a = given.get("a", 1.0)
+    b = given.get("b", 0.0)
+    c = given.get("c", 0.0)
+    d = given.get("d", -b / a if a else 0.0)
+    e = given.get("e", 0.0)
+    f = given.get("f", e)
     numbers = np.linspace(0, 1, 65536)
     power = np.maximum(a * numbers + b, 0) ** g + e
     light = np.where(numbers >= d, power, c * numbers + f)
