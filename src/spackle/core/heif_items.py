@@ -202,17 +202,17 @@ def _item_infos(iinf: memoryview | None) -> tuple[dict[int, bytes], frozenset[in
         # Version 0 counts the entries with 2 bytes, later ones with 4.
         entries = iinf[8:] if iinf[0] else iinf[6:]
         for kind, entry in _boxes(entries):
-            # Versions before 2 are those of other files, without types.
+            # Older versions than 2, of the same box in other kinds of files, state no type.
             if kind != b"infe" or entry[0] < 2 or len(types) >= MAX_ITEMS:
                 continue
             number = struct.Struct(">H" if entry[0] == 2 else ">I")
             (item,) = number.unpack_from(entry, 4)
             type_begin = 4 + number.size + 2  # behind the number and 2 bytes about protection
             types[item] = bytes(entry[type_begin : type_begin + 4])
-            if entry[3] & 1:
+            if entry[3] & 1:  # the last flag
                 hidden.add(item)
     except BOX_ERRORS:
-        pass  # the entries so far hold
+        pass  # the entries that were read before count
     return types, frozenset(hidden)
 
 
@@ -229,7 +229,7 @@ def _item_references(iref: memoryview | None) -> list[tuple[bytes, int, list[int
             targets = struct.unpack_from(f">{count}{letter}", body, head.size)
             references.append((kind, source, list(targets)))
     except BOX_ERRORS:
-        pass  # the references so far hold
+        pass  # the references that were read before count
     return references
 
 
@@ -277,7 +277,7 @@ def _item_pieces(
             if method in (0, 1):
                 pieces_of_items[item] = pieces
     except BOX_ERRORS:
-        pass  # the items so far hold
+        pass  # the items that were read before count
     return pieces_of_items
 
 

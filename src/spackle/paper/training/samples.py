@@ -174,7 +174,7 @@ class Sample:
 
     @property
     def surroundings(self) -> HoleSurroundings:
-        """[h, w]: the inputs of networks that a crop cannot compute by itself."""
+        """The inputs of networks that a crop cannot compute by itself, for h×w cells."""
         view = self.view
         return HoleSurroundings(
             rim_rgb=view.far_rim.rgb,
