@@ -76,7 +76,8 @@ def write_about(folder: Path, title: str, about: str) -> None:
 def write_middlebury(root: Path) -> None:
     """Write Middlebury's Motorcycle, as scikit-image brings it, with a scene.json."""
     folder = root / "Motorcycle"
-    left, right, disparity = pictures.stereo_motorcycle()
+    library: Any = pictures  # scikit-image has no types
+    left, right, disparity = library.stereo_motorcycle()
     save_image(folder / "left.png", left)
     save_image(folder / "right.png", right)
     np.save(folder / "disparity.npy", disparity)

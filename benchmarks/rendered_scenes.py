@@ -366,7 +366,8 @@ def _light_direction(scene: Scene, number: int) -> Array:
         angle = 2 * math.pi * (number - LAMP_RAYS + 0.3) / sky_rays
         # Half-way up; light from the camera's side reaches what the picture shows.
         direction = np.array([0.8 * math.cos(angle), -0.8, 0.6 * math.sin(angle) - 0.45])
-    return direction / np.linalg.norm(direction)
+    unit: Array = direction / np.linalg.norm(direction)
+    return unit
 
 
 def _sky(scene: Scene, rays: Array) -> Array:
@@ -374,7 +375,8 @@ def _sky(scene: Scene, rays: Array) -> Array:
     up = (-rays[:, 1] / np.linalg.norm(rays, axis=1)).clip(0, 1)[:, None] ** 0.6
     zenith, horizon = (np.array(color) ** GAMMA for color in scene.sky)
     # A surface's light is at most 1 in all, and so is the sky's.
-    return (up * zenith + (1 - up) * horizon).astype(np.float32)
+    colors: Array = up * zenith + (1 - up) * horizon
+    return colors.astype(np.float32)
 
 
 # --- the scenes
