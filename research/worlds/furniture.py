@@ -8,10 +8,10 @@ MAX_TRIANGLES = 130_000  # a more detailed model would take a second of a world'
 # Names of catalogue models, as in "Scopia#bed1" after the mark.
 GROUPS: dict[str, str] = {
     "sofa": (
-        "sofa couch sofa2 couch2 winchesterSofa sofa3 couch3 futon-couch mid-century-bench- "
-        "sofa mid-century-sofa clear_sofa simple_sofa beige_sofa_2seats beige_sofa "
-        "burlap_sofa leather_sofa sofa_white_beige L_shaped_sofa cornerSofa convertible-sofa- "
-        "BZ-closed rattanSofa"
+        "sofa couch sofa2 couch2 winchesterSofa sofa3 couch3 futon-couch "
+        "mid-century-bench-sofa mid-century-sofa clear_sofa simple_sofa beige_sofa_2seats "
+        "beige_sofa burlap_sofa leather_sofa sofa_white_beige L_shaped_sofa cornerSofa "
+        "convertible-sofa-BZ-closed rattanSofa"
     ),
     "armchair": (
         "armchair armchair1 armchair2 armchair3 winchesterArmchair fotel mid-century-chair "
@@ -29,8 +29,8 @@ GROUPS: dict[str, str] = {
         "children_chair"
     ),
     "dining_table": (
-        "oakTable table table4 black_table white_kitchen_table table-on-trestles table-with- "
-        "leaning-feet round-table wooden_table_office folding-table tableWithTablecloth "
+        "oakTable table table4 black_table white_kitchen_table table-on-trestles "
+        "table-with-leaning-feet round-table wooden_table_office folding-table tableWithTablecloth "
         "wooden_office_pear_table_rect cafe_set_mota_table table3"
     ),
     "coffee_table": (
@@ -51,8 +51,8 @@ GROUPS: dict[str, str] = {
     "bedside": "bedsideTable bedsideTable2 green_stool",
     "wardrobe": "wardrobe wardrobe1 wardrobe2 wardrobeWithSlidingDoors cupboard",
     "sideboard": (
-        "chest dresserWithDrawers tvStand televisionCabinet shelves changing-table dressing- "
-        "table box_room filing-cabinet"
+        "chest dresserWithDrawers tvStand televisionCabinet shelves changing-table "
+        "dressing-table box_room filing-cabinet"
     ),
     "tv_stand": "tvStand shelves chest dresserWithDrawers",
     "tv": "led_tv tv",
@@ -114,8 +114,8 @@ GROUPS: dict[str, str] = {
         "toyTrain xylophone doll doll-house basketball ballonFoot tricycle skateboard scooter"
     ),
     "floor_clutter": (
-        "slippers sneakers woman_shoes mocassin bootie backpack briefcase handbag cardboard- "
-        "box open-cardboard-box basketball ballonFoot crate suitcase box shopping-basket "
+        "slippers sneakers woman_shoes mocassin bootie backpack briefcase handbag "
+        "cardboard-box open-cardboard-box basketball ballonFoot crate suitcase box shopping-basket "
         "recycling-bin clothes-basket gift dustbin wood_logs umbrellaFolded folded_clothes "
         "basin newspaper electricGuitar trunk-large"
     ),
@@ -156,16 +156,16 @@ GROUPS: dict[str, str] = {
         "exterior-door-03 exterior-door-07 exterior-door-01"
     ),
     "wall_thing": (
-        "wall-flat-tv cuckooClock dart_game wall-hanger switch-whites intercom internal- "
-        "unity-air-conditioning wallLight"
+        "wall-flat-tv cuckooClock dart_game wall-hanger switch-whites intercom "
+        "internal-unity-air-conditioning wallLight"
     ),
     "hobby": (
         "poolTable table_football table_tennis flipper treadmill indoor-bike abdominalBench "
         "punching-ball fitnessTower piano electricGuitar workbench"
     ),
     "workshop": (
-        "workbench ammoBox barrel crate pallet tableFan riggedFan fireExtinguisher step- "
-        "ladder-metal step-ladder-wood cardboard-box open-cardboard-box clothes-horse mower "
+        "workbench ammoBox barrel crate pallet tableFan riggedFan fireExtinguisher "
+        "step-ladder-metal step-ladder-wood cardboard-box open-cardboard-box clothes-horse mower "
         "bicycle bike wheelbarrow shopping-basket lockedLocker electric_water_heater_big "
         "chest-freezer suitcase recycling-bin residential-trashcan tricycle scooter2 "
         "wood_logs utility-shelving stroller japanese_style_screen water_cooler speaker3 "

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from made_models import BOX, MODELS, write_catalogue
 from worlds.catalogue import read_catalogue, read_model
+from worlds.furniture import GROUPS
 from worlds.library import Library
 from worlds.meshes import Material, box, face_normals, joined, smooth_normals
 from worlds.obj_files import read_mtl, read_obj
@@ -113,3 +114,8 @@ def test_joined_meshes_share_equal_materials() -> None:
     both = joined([box((0, 0, 0), (1, 1, 1), red), box((2, 0, 0), (3, 1, 1), red)])
     assert both.count == 24
     assert both.materials == (red,)
+
+
+def test_no_line_break_cuts_the_name_of_a_model_in_two() -> None:
+    names = [name for group in GROUPS.values() for name in group.split()]
+    assert [name for name in names if name.startswith("-") or name.endswith("-")] == []
