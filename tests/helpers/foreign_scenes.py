@@ -19,6 +19,7 @@ from PIL import Image
 
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
+from spackle.core.spherical_harmonics import harmonics_of
 
 C0 = 0.28209479177387814
 Files = dict[str, bytes]  # by name; the first one is the scene
@@ -29,7 +30,7 @@ class Columns:
     """The numbers of Gaussians in float64, in the units of INRIA's PLY."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        m, q, s, o, c = (tensor.double() for tensor in gaussians.tensors)
+        m, q, s, o, c = (tensor.double() for tensor in gaussians.with_harmonics_count(0).tensors)
         self.count = len(gaussians)
         self.means = m.numpy()
         self.quats = torch.nn.functional.normalize(q, dim=1).numpy()  # wxyz
@@ -38,6 +39,9 @@ class Columns:
         self.opacities = o.numpy()
         self.srgb = linear_to_srgb(c).numpy()
         self.harmonics = (self.srgb - 0.5) / C0
+        self.rest = None  # [N, K, 3] coefficients of the degrees 1 to 3
+        if gaussians.harmonics is not None:
+            self.rest = gaussians.harmonics.double().numpy()
 
 
 def turned(columns: Columns, axes: Array) -> tuple[Array, Array]:
@@ -45,6 +49,21 @@ def turned(columns: Columns, axes: Array) -> tuple[Array, Array]:
     sign = round(float(np.linalg.det(axes)))
     rotation = torch.from_numpy(sign * axes) @ quat_to_matrix(torch.from_numpy(columns.quats))
     return columns.means @ axes.T, quat_from_matrix(rotation).numpy()
+
+
+def turned_rest(rest: Array, axes: Array) -> Array:
+    """Coefficients [N, K, 3] of the same functions of directions along other axes.
+
+    They are found from the functions' values in many directions.
+    """
+    degree = math.isqrt(rest.shape[1] + 1) - 1
+    generator = torch.Generator().manual_seed(1)
+    directions = torch.randn(100, 3, dtype=torch.float64, generator=generator)
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    values = np.einsum("dk,nkc->dnc", harmonics_of(directions, degree).numpy(), rest)
+    basis = harmonics_of(directions @ torch.from_numpy(axes.T), degree).numpy()
+    found = np.linalg.lstsq(basis, values.reshape(len(values), -1), rcond=None)[0]
+    return found.reshape(-1, len(rest), 3).transpose(1, 0, 2)
 
 
 # ---------------------------------------------------------------- PLY
@@ -57,7 +76,10 @@ def inria_table(gaussians: Gaussians, harmonics: int = 45) -> dict[str, Array]:
     table = {name: c.means[:, i] for i, name in enumerate("xyz")}
     table |= {f"n{name}": zero for name in "xyz"}
     table |= {f"f_dc_{i}": c.harmonics[:, i] for i in range(3)}
-    table |= {f"f_rest_{i}": zero + 0.01 * i for i in range(harmonics)}
+    rest = np.stack([zero + 0.01 * i for i in range(harmonics)], 1) if harmonics else c.means[:, :0]
+    if c.rest is not None:
+        rest = c.rest.transpose(0, 2, 1).reshape(c.count, -1)
+    table |= {f"f_rest_{i}": values for i, values in enumerate(rest.T)}
     table |= {"opacity": c.logits}
     table |= {f"scale_{i}": c.logs[:, i] for i in range(3)}
     return table | {f"rot_{i}": c.quats[:, i] for i in range(4)}
@@ -110,10 +132,15 @@ def spz(
     degree: int = 0,
     axes: int = 0,
     basis: Array | None = None,
+    bounds: tuple[float, float] | None = None,
 ) -> bytes:
-    """An SPZ file; `axes` is the number of the axes in an extension, `basis` these axes [3, 3]."""
+    """An SPZ file; `axes` is the number of the axes in an extension, `basis` these axes [3, 3].
+
+    Harmonics are those of the Gaussians, or any of a degree; another extension has their `bounds`.
+    """
     c = Columns(gaussians)
-    means, quats = turned(c, np.diag([1.0, -1, -1]) if basis is None else basis)
+    basis = np.diag([1.0, -1, -1]) if basis is None else basis
+    means, quats = turned(c, basis)
     if version == 1:
         places = means.astype("<f2").tobytes()
     else:
@@ -130,10 +157,18 @@ def spz(
         rotations = b"".join(struct.pack("<I", smallest_three(q)) for q in xyzw)
     harmonics = bytes(range(100)) * c.count
     harmonics = harmonics[: c.count * 3 * ((degree + 1) ** 2 - 1)]
+    if c.rest is not None:
+        rest = turned_rest(c.rest, basis)
+        degree = math.isqrt(rest.shape[1] + 1) - 1
+        low, high = bounds or (-1, 255 / 128 - 1)
+        codes = np.clip(np.round((rest - low) / (high - low) * 255), 0, 255)
+        harmonics = codes.astype(np.uint8).tobytes()
     parts = [places, opacities, colors.tobytes(), scales, rotations, harmonics]
 
-    flags = 2 if axes else 0
+    flags = 2 if axes or bounds else 0
     extension = struct.pack("<II4xIII", 0x12340001, 4, 0xADBE0003, 4, axes) if axes else b""
+    if bounds:
+        extension += struct.pack("<IIBBff", 0xADBE0001, 10, 8, 8, *bounds)
     head = struct.pack("<4sIIBBB", b"NGSP", version, c.count, degree, 12, flags)
     if version < 4:
         return gzip.compress(head + b"\0" + b"".join(parts) + extension)
@@ -171,7 +206,10 @@ def zstd_frame(data: bytes) -> bytes:
 
 
 def sog(gaussians: Gaussians, version: int, *, bands: int = 0) -> Files:
-    """The files of an unbundled SOG scene, the description first."""
+    """The files of an unbundled SOG scene, the description first.
+
+    Harmonics are those of the Gaussians, or zeros for as many `bands`.
+    """
     c = Columns(gaussians)
     width = math.ceil(math.sqrt(c.count))
     logs = np.sign(c.means) * np.log1p(np.abs(c.means))
@@ -193,20 +231,43 @@ def sog(gaussians: Gaussians, version: int, *, bands: int = 0) -> Files:
         meta["sh0"] = {"codebook": book.tolist(), "files": ["sh0.webp"]}
         opacities = np.round(c.opacities * 255)[:, None]
         sh0 = np.concatenate([colors, opacities], axis=1)
-        if bands:
-            meta["shN"] = {"count": 1, "bands": bands, "files": ["c.webp", "l.webp"]}
     else:
         meta["means"] |= {"shape": [c.count, 3], "dtype": "float32"}
         scales, bounds = fractions(c.logs, 255)
         meta["scales"] = {**bounds, "shape": [c.count, 3], "files": ["scales.webp"]}
         sh0, bounds = fractions(np.concatenate([c.harmonics, c.logits[:, None]], axis=1), 255)
         meta["sh0"] = {**bounds, "shape": [c.count, 1, 4], "files": ["sh0.webp"]}
-        if bands:
-            shape = [c.count, 3 * ((bands + 1) ** 2 - 1)]
-            meta["shN"] = {"shape": shape, "files": ["c.webp", "l.webp"]}
+    rest = c.rest
+    if rest is None:
+        rest = np.zeros((c.count, (bands + 1) ** 2 - 1, 3))
+    bands = math.isqrt(rest.shape[1] + 1) - 1
+    centroids = np.zeros((0, 0, 4), np.uint8)
+    if bands:
+        # A palette of all Gaussians, in the opposite order; 64 of them side by side.
+        entries = rest[::-1]
+        low, high = float(rest.min()), float(rest.max())
+        codes = np.round((entries - low) / max(high - low, 1e-9) * 255).astype(np.uint8)
+        rows = math.ceil(c.count / 64)
+        centroids = np.full((rows * 64 * rest.shape[1], 4), 255, np.uint8)
+        centroids[: codes.shape[0] * codes.shape[1], :3] = codes.reshape(-1, 3)
+        centroids = centroids.reshape(rows, 64 * rest.shape[1], 4)
+        meta["shN"] = {"files": ["c.webp", "l.webp"]}
+        if version == 2:
+            book = np.linspace(low, high, 256).tolist()
+            meta["shN"] |= {"count": c.count, "bands": bands, "codebook": book}
+        else:
+            shape = [c.count, 3 * rest.shape[1]]
+            meta["shN"] |= {"shape": shape, "mins": low, "maxs": high, "quantization": 8}
     pictures = {"means_l.webp": means % 256, "means_u.webp": means // 256}
     pictures |= {"quats.webp": quats, "scales.webp": scales, "sh0.webp": sh0}
+    if bands:
+        labels = np.arange(c.count)[::-1]
+        pictures["l.webp"] = np.stack([labels % 256, labels // 256], axis=1)
     files = {"meta.json": json.dumps(meta).encode()}
+    if bands:
+        stream = io.BytesIO()
+        Image.fromarray(centroids).save(stream, "WEBP", lossless=True, exact=True)
+        files["c.webp"] = stream.getvalue()
     for name, values in pictures.items():
         pixels = np.full((width * width, 4), 255, np.uint8)
         pixels[: c.count, : values.shape[1]] = values
@@ -315,6 +376,11 @@ def khr_gltf(gaussians: Gaussians, *, log_scales: bool = False, quantized: bool 
     file.add(f"{KHR}:SCALE", c.logs if log_scales else np.exp(c.logs))
     file.add(f"{KHR}:OPACITY", c.opacities, "u2" if quantized else "f4", **whole)
     file.add(f"{KHR}:SH_DEGREE_0_COEF_0", c.harmonics)
+    if c.rest is not None:
+        rest = turned_rest(c.rest, LEFT_UP_FRONT)
+        names = [(degree, order) for degree in (1, 2, 3) for order in range(2 * degree + 1)]
+        for index, (degree, order) in enumerate(names[: rest.shape[1]]):
+            file.add(f"{KHR}:SH_DEGREE_{degree}_COEF_{order}", rest[:, index])
     return file
 
 

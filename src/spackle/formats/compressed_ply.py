@@ -55,6 +55,12 @@ COLOR_BOUNDS = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"]
 CHUNK_PROPERTIES = [*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS]
 
 
+# The coefficient of a harmonic is the byte b as (b + ½) / 256 in 0..1, of which 0 stands for -4 and
+# 1 for 4; the bytes 0 and 255 are these bounds.
+HARMONICS_SPAN = 8
+HARMONICS_TABLE = "sh"
+
+
 def encode_compressed_ply(scene: SceneFile) -> bytes:
     """Encode a scene as a compressed PLY, with y down and z forward.
 
@@ -63,23 +69,53 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
 
     The values of 256 consecutive Gaussians (a chunk) are stored as fractions between their bounds.
     So the Gaussians are sorted, and neighbours in space become neighbours in the file. Gaussians
-    that come from the photo stay before those that fill holes.
+    that come from the photo stay before those that fill holes. Harmonics, in a table of their own,
+    are bytes.
 
     Raises:
         ValueError: a Gaussian is not finite.
     """
     columns = GaussianColumns.from_gaussians(scene.gaussians).select(file_order(scene))
 
+    harmonics_rows = b""
+    harmonics_tables = []
+    if columns.harmonics is not None:
+        codes = _encode_harmonics(columns.harmonics)
+        harmonics_rows = codes.tobytes()
+        names = [f"f_rest_{index}" for index in range(codes.shape[1])]
+        harmonics_tables = [
+            NewTable(name=HARMONICS_TABLE, row_count=len(codes), type="uchar", properties=names)
+        ]
+
     chunks, vertices = _encode_tables(columns)
     header = ply_header(
         NewTable(name="chunk", row_count=len(chunks), type="float", properties=CHUNK_PROPERTIES),
         NewTable(name="vertex", row_count=len(vertices), type="uint", properties=PACKED_PROPERTIES),
+        *harmonics_tables,
         camera=scene.camera_at_origin,
         base_count=scene.base_count,
         disparity=scene.disparity,
         is_metric=scene.is_metric,
     )
-    return header + chunks.tobytes() + vertices.tobytes()
+    return header + chunks.tobytes() + vertices.tobytes() + harmonics_rows
+
+
+def _encode_harmonics(harmonics: Floats) -> NDArray[np.uint8]:
+    """Return coefficients [N, K, 3] as bytes [N, 3·K]: all of red, then of green, then of blue."""
+    by_color = harmonics.transpose(0, 2, 1).reshape(len(harmonics), -1)
+    fractions = by_color / np.float32(HARMONICS_SPAN) + np.float32(0.5)
+    codes: NDArray[np.uint8] = np.clip(np.floor(fractions * 256), 0, 255).astype(np.uint8)
+    return codes
+
+
+def decode_harmonics(codes: NDArray[np.uint8]) -> Floats:
+    """Return the coefficients [N, K, 3] of bytes [N, 3·K]; the inverse of `_encode_harmonics`."""
+    fractions = (codes.astype(np.float32) + np.float32(0.5)) / np.float32(256)
+    fractions[codes == 0] = 0
+    fractions[codes == 255] = 1
+    coefficients: Floats = (fractions - np.float32(0.5)) * np.float32(HARMONICS_SPAN)
+    by_color = coefficients.reshape(len(codes), 3, -1)
+    return by_color.transpose(0, 2, 1)
 
 
 def file_order(scene: SceneFile) -> NDArray[np.int64]:
@@ -219,12 +255,15 @@ def _pack_fractions(fractions: Floats, bit_counts: tuple[int, ...]) -> NDArray[n
     return words
 
 
-def decode_compressed_ply(chunks: NDArray[Any], vertices: NDArray[Any]) -> GaussianColumns:
-    """Decode the two tables of a compressed PLY.
+def decode_compressed_ply(
+    chunks: NDArray[Any], vertices: NDArray[Any], harmonics: NDArray[np.uint8] | None = None
+) -> GaussianColumns:
+    """Decode the tables of a compressed PLY.
 
     Args:
         chunks: [C] rows with the fields CHUNK_PROPERTIES; older files have no COLOR_BOUNDS.
         vertices: [N] rows with the fields PACKED_PROPERTIES.
+        harmonics: [N, 3·K] bytes of K harmonics, if the file has any.
 
     Raises:
         ValueError: bounds are missing, or there are too few chunks for the vertices.
@@ -256,7 +295,8 @@ def decode_compressed_ply(chunks: NDArray[Any], vertices: NDArray[Any]) -> Gauss
         quats=decode_smallest_three(largest, others),
         log_scales=_from_fractions(scale_fractions, chunks, SCALE_BOUNDS),
         opacities=rgba[:, 3],
-        srgb=np.clip(srgb, 0, 1),
+        srgb=srgb if harmonics is not None else np.clip(srgb, 0, 1),
+        harmonics=None if harmonics is None else decode_harmonics(harmonics),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians, quat_from_matrix, quat_multiply
+from spackle.core.spherical_harmonics import degree_of_count, rotate_harmonics
+from spackle.core.view_colors import extended_linear_to_srgb, extended_srgb_to_linear
 
 Floats = NDArray[np.float32]
 
@@ -38,22 +41,26 @@ class GaussianColumns:
     quats: Floats  # [N, 4] rotations as unit quaternions (w, x, y, z)
     log_scales: Floats  # [N, 3] natural logarithms of the standard deviations
     opacities: Floats  # [N] in 0..1
-    srgb: Floats  # [N, 3] colours in 0..1
+    srgb: Floats  # [N, 3] colours in 0..1; with harmonics, they may lie outside
+    # [N, 3 | 8 | 15, 3] coefficients of the spherical harmonics of the degrees 1 to 1, 2 or 3;
+    # None: colours do not change with the view.
+    harmonics: Floats | None = None
 
     @staticmethod
     @torch.no_grad()
     def from_gaussians(gaussians: Gaussians) -> GaussianColumns:
         """Convert Gaussians to columns with values that every format can store.
 
-        Colours and opacities are clamped to 0..1, and scales to MIN_SCALE..MAX_SCALE. A quaternion
-        of length 0 becomes (1, 0, 0, 0), the rotation by 0°.
+        Opacities are clamped to 0..1, scales to MIN_SCALE..MAX_SCALE, and colours to 0..1 unless
+        they change with the view. A quaternion of length 0 becomes (1, 0, 0, 0), the rotation by
+        0°.
 
         Raises:
             ValueError: a value is not finite; only scales may be infinite.
         """
-        gaussians = gaussians.detach().to("cpu", torch.float32).with_harmonics_count(0)
-        names = ("means", "quats", "scales", "opacities", "colors")
-        for name, tensor in zip(names, gaussians.tensors, strict=True):
+        gaussians = gaussians.detach().to("cpu", torch.float32)
+        names = ("means", "quats", "scales", "opacities", "colors", "harmonics")
+        for name, tensor in zip(names, gaussians.tensors, strict=False):  # harmonics may be missing
             # An infinite scale is allowed, because it is clamped below; NaN is not.
             checked = tensor.clamp(-1, 1) if name == "scales" else tensor
             if not torch.isfinite(checked).all():
@@ -62,12 +69,16 @@ class GaussianColumns:
         # NumPy's logarithm is used, because PyTorch's would start threads in each call, and a
         # writer may call this function for many small blocks of Gaussians.
         scales = np.clip(gaussians.scales.numpy(), MIN_SCALE, MAX_SCALE)
+        harmonics = gaussians.harmonics
+        # The colour that a camera sees is clamped only after the change by harmonics.
+        encode = linear_to_srgb if harmonics is None else extended_linear_to_srgb
         return GaussianColumns(
             means=gaussians.means.numpy(),
             quats=_unit_quats(gaussians.quats).numpy(),
             log_scales=np.log(scales),
             opacities=gaussians.opacities.clamp(0, 1).numpy(),
-            srgb=linear_to_srgb(gaussians.colors).numpy(),  # clamps the colours
+            srgb=encode(gaussians.colors).numpy(),
+            harmonics=None if harmonics is None else harmonics.numpy(),
         )
 
     def to_gaussians(self) -> Gaussians:
@@ -79,7 +90,9 @@ class GaussianColumns:
         # A large logarithm gives an infinite scale, which is refused below.
         with np.errstate(over="ignore", invalid="ignore"):
             scales = np.exp(self.log_scales)
-        columns = (self.means, self.quats, scales, self.opacities, self.srgb)
+        columns = [self.means, self.quats, scales, self.opacities, self.srgb]
+        if self.harmonics is not None:
+            columns.append(self.harmonics)
 
         count = len(self.means)
         is_finite = np.ones(count, bool)
@@ -90,13 +103,25 @@ class GaussianColumns:
             raise ValueError(f"{broken_count} of {count} Gaussians are not finite")
 
         kept_rows = is_finite if broken_count else slice(None)
-        means, quats, scale_tensor, opacities, srgb = (
+        means, quats, scale_tensor, opacities, srgb, *harmonics = (
             torch.from_numpy(np.array(column[kept_rows], np.float32)) for column in columns
         )
-        return Gaussians(means, quats, scale_tensor, opacities, srgb_to_linear(srgb))
+        decode = extended_srgb_to_linear if harmonics else srgb_to_linear
+        return Gaussians(means, quats, scale_tensor, opacities, decode(srgb), *harmonics)
 
     @property
-    def harmonics(self) -> Floats:
+    def harmonics_degree(self) -> int:
+        """The highest degree of the harmonics, 0 to 3."""
+        return 0 if self.harmonics is None else degree_of_count(self.harmonics.shape[1])
+
+    def without_harmonics(self) -> GaussianColumns:
+        """The Gaussians with colours in 0..1 that do not change with the view."""
+        if self.harmonics is None:
+            return self
+        return dataclasses.replace(self, srgb=np.clip(self.srgb, 0, 1), harmonics=None)
+
+    @property
+    def constant_harmonics(self) -> Floats:
         """[N, 3] coefficients of the constant spherical harmonic that give the sRGB colours."""
         return (self.srgb - np.float32(0.5)) / np.float32(SH_C0)
 
@@ -109,7 +134,12 @@ class GaussianColumns:
         flipped_means = self.means * np.array([1, -1, -1], np.float32)
         # Conjugation with the rotation by 180° about x negates y and z of (w, x, y, z).
         flipped_quats = self.quats * np.array([1, 1, -1, -1], np.float32)
-        return dataclasses.replace(self, means=flipped_means, quats=flipped_quats)
+        return dataclasses.replace(
+            self,
+            means=flipped_means,
+            quats=flipped_quats,
+            harmonics=self._turned_harmonics(np.diag([1.0, -1.0, -1.0])),
+        )
 
     def to_opencv_axes(self, letters: str) -> GaussianColumns:
         """Return the scene with x right, y down and z forward.
@@ -126,14 +156,35 @@ class GaussianColumns:
         is_mirrored = np.linalg.det(new_axes) < 0
         rotation = torch.from_numpy(-new_axes if is_mirrored else new_axes)
         turned = quat_multiply(quat_from_matrix(rotation), torch.from_numpy(self.quats))
-        return dataclasses.replace(self, means=self.means @ new_axes.T, quats=turned.numpy())
+        return dataclasses.replace(
+            self,
+            means=self.means @ new_axes.T,
+            quats=turned.numpy(),
+            harmonics=self._turned_harmonics(new_axes),
+        )
+
+    def _turned_harmonics(self, rotation: NDArray[Any]) -> Floats | None:
+        """The coefficients after a rotation [3, 3] of the scene, which may also mirror it."""
+        if self.harmonics is None:
+            return None
+        coefficients = torch.from_numpy(self.harmonics)
+        return rotate_harmonics(coefficients, torch.from_numpy(rotation)).numpy()
 
     @staticmethod
     def cat(parts: Sequence[GaussianColumns]) -> GaussianColumns:
-        """Join sets of Gaussians in the given order."""
-        names = [field.name for field in dataclasses.fields(GaussianColumns)]
-        columns = ([getattr(part, name) for part in parts] for name in names)
-        return GaussianColumns(*(np.concatenate(arrays) for arrays in columns))
+        """Join sets of Gaussians in the given order; harmonics that a set lacks are zeros."""
+        names = ("means", "quats", "log_scales", "opacities", "srgb")
+        columns = [np.concatenate([getattr(part, name) for part in parts]) for name in names]
+        counts = [0 if part.harmonics is None else part.harmonics.shape[1] for part in parts]
+        if not any(counts):
+            return GaussianColumns(*columns)
+        harmonics = np.zeros((len(columns[0]), max(counts), 3), np.float32)
+        start = 0
+        for part, count in zip(parts, counts, strict=True):
+            if part.harmonics is not None:
+                harmonics[start : start + len(part.means), :count] = part.harmonics
+            start += len(part.means)
+        return dataclasses.replace(GaussianColumns(*columns), harmonics=harmonics)
 
     def scaled(self, factor: float) -> GaussianColumns:
         """The scene in another unit of length: centres and scales times a factor."""
@@ -147,8 +198,14 @@ class GaussianColumns:
 
     def select(self, rows: NDArray[np.int64] | slice) -> GaussianColumns:
         """Return the Gaussians that an index array [M] or a slice selects."""
-        names = [field.name for field in dataclasses.fields(self)]
-        return GaussianColumns(*(getattr(self, name)[rows] for name in names))
+        return GaussianColumns(
+            means=self.means[rows],
+            quats=self.quats[rows],
+            log_scales=self.log_scales[rows],
+            opacities=self.opacities[rows],
+            srgb=self.srgb[rows],
+            harmonics=None if self.harmonics is None else self.harmonics[rows],
+        )
 
 
 def axes_to_opencv(letters: str) -> NDArray[np.float32]:
@@ -168,10 +225,15 @@ def axes_to_opencv(letters: str) -> NDArray[np.float32]:
     return matrix
 
 
+def colors_of_harmonics(srgb: Floats, degree: int) -> Floats:
+    """Colours [N, 3] as read: in 0..1, unless harmonics of another degree than 0 add to them."""
+    return srgb if degree > 0 else np.clip(srgb, 0, 1)
+
+
 def harmonics_to_srgb(harmonics: Floats) -> Floats:
     """Return the colours of coefficients of the constant spherical harmonic, not clamped.
 
-    The inverse of `GaussianColumns.harmonics`: srgb = harmonics / (2 √π) + 0.5.
+    The inverse of `GaussianColumns.constant_harmonics`: srgb = harmonics / (2 √π) + 0.5.
     """
     return harmonics * np.float32(SH_C0) + np.float32(0.5)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
+from spackle.core.spherical_harmonics import HARMONICS_COUNTS
 from spackle.formats.gaussian_columns import GaussianColumns
 from spackle.formats.quantization import ordinary_length_factor
 from spackle.formats.scene_content import SceneFile
@@ -23,6 +24,7 @@ EXTENSION = "KHR_gaussian_splatting"
 
 MAX_GLB_BYTES = 2**32 - 1  # a .glb states its size in 32 bits
 ATTRIBUTE_BYTES_PER_GAUSSIAN = 64
+HARMONIC_BYTES = 12  # of the three colours of a coefficient
 MAX_DESCRIPTION_BYTES = 1 << 16  # more than the JSON part takes
 
 # glTF's numbers for types, buffers and kinds of primitives.
@@ -40,7 +42,7 @@ def encode_glb(scene: SceneFile) -> bytes:
     """Encode a scene as binary glTF with the extension KHR_gaussian_splatting.
 
     The Gaussians keep their order; the axes become y up and z backward. Scales are linear, colours
-    are coefficients of the constant spherical harmonic. A viewer that does not know the extension
+    are coefficients of spherical harmonics. A viewer that does not know the extension
     shows points with the linear colours of the attribute COLOR_0. The photo's camera becomes a
     glTF camera. The fields `extras` hold what glTF cannot express: how many Gaussians come from
     the photo, and the camera's principal point and size.
@@ -52,7 +54,9 @@ def encode_glb(scene: SceneFile) -> bytes:
     count = len(scene.gaussians)
     if count == 0:
         raise InputError("glTF cannot hold a scene without Gaussians: use another format")
-    if count * ATTRIBUTE_BYTES_PER_GAUSSIAN + MAX_DESCRIPTION_BYTES > MAX_GLB_BYTES:
+    bytes_per_gaussian = ATTRIBUTE_BYTES_PER_GAUSSIAN
+    bytes_per_gaussian += HARMONIC_BYTES * scene.gaussians.harmonics_count
+    if count * bytes_per_gaussian + MAX_DESCRIPTION_BYTES > MAX_GLB_BYTES:
         problem = f"{count:,} Gaussians are too many for .glb (4 GiB at most)"
         raise InputError(f"{problem}: use another format")
 
@@ -86,14 +90,21 @@ def _attribute_arrays(columns: GaussianColumns) -> dict[str, NDArray[Any]]:
     linear_rgb = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
     rgba = np.concatenate([linear_rgb, columns.opacities[:, None]], axis=1)  # [N, 4]
     xyzw = columns.quats[:, [1, 2, 3, 0]]  # glTF has w last
-    return {
+    arrays = {
         "POSITION": columns.means.astype("<f4"),
         f"{EXTENSION}:ROTATION": xyzw.astype("<f4"),
         f"{EXTENSION}:SCALE": np.exp(columns.log_scales).astype("<f4"),
         f"{EXTENSION}:OPACITY": columns.opacities.astype("<f4"),
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": columns.harmonics.astype("<f4"),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": columns.constant_harmonics.astype("<f4"),
         "COLOR_0": np.round(rgba * 65_535).astype("<u2"),
     }
+    if columns.harmonics is not None:
+        for degree in range(1, columns.harmonics_degree + 1):
+            first = HARMONICS_COUNTS[degree - 1]
+            for index in range(2 * degree + 1):
+                name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
+                arrays[name] = columns.harmonics[:, first + index].astype("<f4")
+    return arrays
 
 
 def _describe_scene(

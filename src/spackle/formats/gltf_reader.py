@@ -18,6 +18,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import quat_from_matrix, quat_multiply, quat_to_matrix
+from spackle.core.spherical_harmonics import MAX_DEGREE, rotate_harmonics
 from spackle.formats.camera_files import camera_from_json
 from spackle.formats.gaussian_columns import (
     MAX_SCALE,
@@ -187,6 +188,20 @@ def _read_primitive(
     return columns.to_opencv_axes(axes), max(degrees)
 
 
+def _read_harmonics(file: GltfFile, attributes: Mapping[str, Any]) -> Floats | None:
+    """Read the coefficients [N, K, 3] of the degrees 1 to 3, with the axes of the file.
+
+    A degree counts only if all its coefficients, and those of lower degrees, are there.
+    """
+    coefficients: list[Floats] = []
+    for degree in range(1, MAX_DEGREE + 1):
+        names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
+        if not all(name in attributes for name in names):
+            break
+        coefficients += [file.array(attributes[name])[:, :3] for name in names]
+    return np.stack(coefficients, axis=1) if coefficients else None
+
+
 def _read_attributes(
     file: GltfFile, attributes: Mapping[str, Any], splatting: Mapping[str, Any]
 ) -> GaussianColumns:
@@ -217,6 +232,9 @@ def _read_attributes(
     else:
         raise ValueError("its Gaussians have no colours")
     is_linear = "lin" in str(splatting.get("colorSpace", "")).lower()
+    # A sum in another space than sRGB would not fit these colours.
+    has_harmonics = harmonics_name in attributes and not is_linear
+    harmonics = _read_harmonics(file, attributes) if has_harmonics else None
     if is_linear:
         rgb = linear_to_srgb(torch.from_numpy(rgb)).numpy()
 
@@ -232,7 +250,8 @@ def _read_attributes(
         quats=_unit_length(xyzw[:, [3, 0, 1, 2]]),
         log_scales=log_scales,
         opacities=np.clip(opacities, 0, 1),
-        srgb=np.clip(rgb, 0, 1),
+        srgb=rgb if harmonics is not None else np.clip(rgb, 0, 1),
+        harmonics=harmonics,
     )
 
 
@@ -279,6 +298,12 @@ def _transformed(
     if not determinant > 0:
         raise UnsupportedSceneError("a node mirrors or flattens its Gaussians: save it without")
     means = (columns.means @ linear.T + translation).astype(np.float32)
+    if columns.harmonics is not None:
+        # Of a stretched scene, colours turn by the rotation that is nearest to the matrix.
+        left, _, right = np.linalg.svd(linear)
+        coefficients = torch.from_numpy(columns.harmonics)
+        turned_harmonics = rotate_harmonics(coefficients, torch.from_numpy(left @ right))
+        columns = dataclasses.replace(columns, harmonics=turned_harmonics.numpy())
 
     # A rotation with an even scale turns and scales each Gaussian.
     scale = determinant ** (1 / 3)

@@ -22,6 +22,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians
+from spackle.core.spherical_harmonics import degree_of_count
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     SHARP_TRAJECTORIES,
@@ -31,6 +32,7 @@ from spackle.core.trajectories import (
     trajectory_cameras,
 )
 from spackle.formats.quantization import encode_smallest_three, ordinary_length_factor
+from spackle.formats.scene_content import harmonics_loss
 from spackle.runtime.errors import InputError
 
 # The page interpolates linearly between this many positions along a path.
@@ -94,7 +96,8 @@ def page_scene(
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal. The
             page's camera goes no farther. None if it is not known.
         note: a text for the user; empty for none. The page shows the whole text for some seconds,
-            and then only its beginning, up to the first semicolon.
+            and then only its beginning, up to the first semicolon. That colours do not change with
+            the view on the page is added where they do in the scene.
         is_metric: whether the scene's unit is known to be the metre.
 
     Raises:
@@ -103,6 +106,10 @@ def page_scene(
     if not bool((base.means[:, 2] > 0).any()):
         problem = "no Gaussian lies in front of the photo's camera"
         raise InputError(f"{name}: {problem}: nothing can be shown")
+
+    if base.harmonics is not None or aux.harmonics is not None:
+        degree = degree_of_count(max(base.harmonics_count, aux.harmonics_count))
+        note = "; ".join(filter(None, [note, harmonics_loss(degree)]))
 
     # The page computes in half and single floats, which suit metres: a scene in another unit is
     # shown in a similar one. Its paths are multiples of its own depths, and so stay the same.

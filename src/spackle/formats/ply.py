@@ -19,15 +19,20 @@ from numpy.typing import NDArray
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
+from spackle.core.view_colors import extended_srgb_to_linear
 from spackle.formats.camera_files import checked_camera
-from spackle.formats.compressed_ply import PACKED_PROPERTIES, decode_compressed_ply
+from spackle.formats.compressed_ply import (
+    HARMONICS_TABLE,
+    PACKED_PROPERTIES,
+    decode_compressed_ply,
+)
 from spackle.formats.gaussian_columns import (
     MAX_BROKEN_RATIO,
     Floats,
     GaussianColumns,
     harmonics_to_srgb,
 )
-from spackle.formats.ply_layout import NoGaussiansError, PlyLayout, plain_name
+from spackle.formats.ply_layout import NoGaussiansError, PlyLayout, plain_name, view_harmonics
 from spackle.formats.ply_tables import NewTable, PlyElement, PlyTables, ply_header
 from spackle.formats.scene_content import SceneFile, left_out_note
 from spackle.runtime.errors import InputError, as_input_error
@@ -52,9 +57,9 @@ SCALES = slice(7, 10)
 QUATS = slice(10, 14)
 BLOCK_HEIGHT = 14
 
-# The properties that are written: also a normal, which some viewers expect.
-WRITTEN_PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-WRITTEN_PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+# The properties that are written before and after those of harmonics; some viewers expect normals.
+FIRST_PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+LAST_PROPERTIES = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 StrPath = str | os.PathLike[str]
 
@@ -71,8 +76,9 @@ def save_ply(
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
     The one table, `vertex`, has float32 columns: the position x y z, a normal of zero, the
-    sRGB colour as the coefficient f_dc of the constant spherical harmonic, the opacity as its
-    logit, the scales as natural logarithms, and the rotation as a unit quaternion (w, x, y, z).
+    sRGB colour as the coefficient f_dc of the constant spherical harmonic, those of the others as
+    f_rest if there are any (all of red, then of green, then of blue), the opacity as its logit,
+    the scales as natural logarithms, and the rotation as a unit quaternion (w, x, y, z).
     A Gaussian gives the same bytes, whatever other Gaussians the scene has. Comments in the
     header keep `camera`, `base_count`, `disparity` and `is_metric`.
 
@@ -128,9 +134,9 @@ def _encode_parts(
             if it is not known.
         is_metric: whether the unit of length is known to be the metre.
     """
-    vertex = NewTable(
-        name="vertex", row_count=len(gaussians), type="float", properties=WRITTEN_PROPERTIES
-    )
+    rest = [f"f_rest_{index}" for index in range(3 * gaussians.harmonics_count)]
+    properties = [*FIRST_PROPERTIES, *rest, *LAST_PROPERTIES]
+    vertex = NewTable(name="vertex", row_count=len(gaussians), type="float", properties=properties)
     yield ply_header(
         vertex, camera=camera, base_count=base_count, disparity=disparity, is_metric=is_metric
     )
@@ -142,7 +148,7 @@ def _encode_parts(
         *(torch.zeros(ROWS_PER_BLOCK, *tensor.shape[1:]) for tensor in gaussians.tensors)
     )
     # One array serves all blocks; its columns of normals stay zero.
-    table = np.zeros((ROWS_PER_BLOCK, len(WRITTEN_PROPERTIES)), "<f4")
+    table = np.zeros((ROWS_PER_BLOCK, len(properties)), "<f4")
     for start in range(0, len(gaussians), ROWS_PER_BLOCK):
         block = gaussians.select(slice(start, start + ROWS_PER_BLOCK))
         missing_rows = slice(len(block), ROWS_PER_BLOCK)
@@ -152,17 +158,22 @@ def _encode_parts(
 
 
 def _fill_table(table: Floats, columns: GaussianColumns) -> None:
-    """Write N Gaussians into the rows of `table` [N, 17], whose columns are WRITTEN_PROPERTIES.
+    """Write N Gaussians into the rows of `table`, [N, 17] or with 3 columns more for each harmonic.
 
-    The columns 3 to 5 are normals. They are not written, because the caller has set them to zero.
+    The columns are FIRST_PROPERTIES; all harmonics of red, then of green, then of blue; and
+    LAST_PROPERTIES. Normals, the columns 3 to 5, are not written: the caller has set them to zero.
     """
     opacities = np.clip(columns.opacities, MIN_OPACITY, MAX_OPACITY)
     table[:, 0:3] = columns.means  # x y z
-    table[:, 6:9] = columns.harmonics  # f_dc_0 f_dc_1 f_dc_2
+    table[:, 6:9] = columns.constant_harmonics  # f_dc_0 f_dc_1 f_dc_2
+    if columns.harmonics is not None:
+        by_color = columns.harmonics.transpose(0, 2, 1)  # [N, 3, K]
+        table[:, 9 : -len(LAST_PROPERTIES)] = by_color.reshape(len(table), -1)  # f_rest
+    last_columns = table[:, -len(LAST_PROPERTIES) :]
     # The logit. It is precise for opacities near 1, too, because 1 - opacity is exact there.
-    table[:, 9] = np.log(opacities / (1 - opacities))
-    table[:, 10:13] = columns.log_scales  # scale_0 scale_1 scale_2
-    table[:, 13:17] = columns.quats  # rot_0 rot_1 rot_2 rot_3
+    last_columns[:, 0] = np.log(opacities / (1 - opacities))
+    last_columns[:, 1:4] = columns.log_scales  # scale_0 scale_1 scale_2
+    last_columns[:, 4:8] = columns.quats  # rot_0 rot_1 rot_2 rot_3
 
 
 def load_ply(path: StrPath) -> Gaussians:
@@ -227,7 +238,7 @@ class PlyFile:
         return "text PLY" if self._tables.is_text else "PLY"
 
     def _harmonics_degree(self) -> int:
-        """Return the degree of the file's spherical harmonics; those above 0 are not read."""
+        """Return the degree of the file's spherical harmonics."""
         # The properties f_rest_0, f_rest_1, … are coefficients: for each degree up to d there are
         # (d + 1)² - 1 of each colour. A compressed file has them in a table of their own.
         count = 0
@@ -245,8 +256,8 @@ class PlyFile:
     def gaussians(self) -> Gaussians:
         """Read the Gaussians, with linear RGB colours.
 
-        The properties may have any order and type. Spherical harmonics above degree 0 (f_rest)
-        are ignored.
+        The properties may have any order and type. Spherical harmonics (f_rest) are read up to
+        degree 3.
 
         A few Gaussians that are not finite, which training leaves behind, are left out; of a scene
         that Spackle completed, none is.
@@ -269,6 +280,10 @@ class PlyFile:
         opacities = torch.empty(count, 1)  # with two axes, as the other tensors have
         scales = torch.empty(count, 3)
         quats = torch.empty(count, 4)
+        # SHARP's linear colours have none, and a sum in sRGB would not fit them.
+        harmonics = None
+        if layout.harmonics and not are_linear:
+            harmonics = torch.empty(count, len(layout.harmonics) // 3, 3)
         # Which rows of the block below go into each tensor.
         groups = [
             (means, MEANS),
@@ -284,11 +299,17 @@ class PlyFile:
         for start in range(0, count, ROWS_PER_BLOCK):
             block_rows = rows[start : start + ROWS_PER_BLOCK]
             stop = start + len(block_rows)
-            is_finite[start:stop] = _convert_block(block, block_rows, layout, are_linear)
+            is_finite[start:stop] = _convert_block(
+                block, block_rows, layout, are_linear, has_harmonics=harmonics is not None
+            )
+            if harmonics is not None:
+                block_harmonics = layout.read_view_harmonics(block_rows)
+                is_finite[start:stop] &= np.isfinite(block_harmonics).all(axis=(1, 2))
+                harmonics[start:stop] = torch.from_numpy(block_harmonics)
             for tensor, group in groups:
                 tensor[start:stop] = torch.from_numpy(block[group, : len(block_rows)].T)
 
-        gaussians = Gaussians(means, quats, scales, opacities[:, 0], colors)
+        gaussians = Gaussians(means, quats, scales, opacities[:, 0], colors, harmonics)
         broken_count = count - int(np.count_nonzero(is_finite))
         if broken_count == 0:
             return gaussians
@@ -406,8 +427,26 @@ class PlyFile:
         problem = "the compressed tables cannot be read: {reason}: export the scene again"
         with as_input_error(self.path, problem):
             chunk_rows = self._tables.rows(chunk)
-            columns = decode_compressed_ply(chunk_rows, self._tables.rows(vertex))
+            harmonics = self._compressed_harmonics(vertex.row_count)
+            columns = decode_compressed_ply(chunk_rows, self._tables.rows(vertex), harmonics)
             return columns.to_gaussians()
+
+    def _compressed_harmonics(self, count: int) -> NDArray[np.uint8] | None:
+        """Return the bytes [count, 3·K] of the harmonics in a compressed file; None without any.
+
+        Raises:
+            ValueError: the table has another number of rows than there are Gaussians.
+        """
+        for element in self._tables.elements_named(HARMONICS_TABLE):
+            stored_names = {name: name for name in element.property_names}
+            names = view_harmonics(stored_names)
+            if not names or not self._tables.has_known_place(element):
+                continue
+            if element.row_count != count:
+                raise ValueError(f"{element.row_count} rows of harmonics for {count} Gaussians")
+            rows = self._tables.rows(element)
+            return np.stack([rows[name].astype(np.uint8) for name in names], axis=1)
+        return None
 
     def _are_colors_linear(self) -> bool:
         """Return whether the stored colours are linear RGB; else they are sRGB.
@@ -451,7 +490,12 @@ class PlyFile:
 
 
 def _convert_block(
-    block: Floats, rows: NDArray[Any], layout: PlyLayout, are_linear: bool
+    block: Floats,
+    rows: NDArray[Any],
+    layout: PlyLayout,
+    are_linear: bool,
+    *,
+    has_harmonics: bool,
 ) -> NDArray[np.bool_]:
     """Convert rows of a PLY file to means, linear colours, opacities, scales and quaternions.
 
@@ -463,6 +507,7 @@ def _convert_block(
         rows: at most ROWS_PER_BLOCK rows of the table, with a field for each property.
         layout: names the properties.
         are_linear: whether the colours are linear RGB; else they are sRGB.
+        has_harmonics: whether the view changes the colours, which are then not clamped.
 
     Returns:
         [len(rows)] which of the Gaussians are finite.
@@ -481,5 +526,6 @@ def _convert_block(
 
     # The colours are checked before their conversion, which would make infinite ones finite.
     is_finite = np.asarray(np.isfinite(block[:, :count]).all(axis=0))
-    block[COLORS] = rgb.clamp_min(0) if are_linear else srgb_to_linear(rgb)
+    decode = extended_srgb_to_linear if has_harmonics else srgb_to_linear
+    block[COLORS] = rgb.clamp_min(0) if are_linear else decode(rgb)
     return is_finite

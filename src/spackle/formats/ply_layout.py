@@ -7,12 +7,14 @@ way belongs into `PlyLayout.find`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spackle.core.spherical_harmonics import HARMONICS_COUNTS, MAX_DEGREE
 from spackle.formats.gaussian_columns import SH_C0, Floats
 
 MEANS = ("x", "y", "z")
@@ -50,6 +52,9 @@ class PlyLayout:
     largest_opacity: float | None  # opacities are fractions of this number; None: logits
     scales: tuple[str, ...]  # natural logarithms: of a ball one, of a disc two, else three
     quats: tuple[str, ...]  # w, x, y, z; none for balls that are not turned
+    # Of the degrees 1 to 1, 2 or 3: all of red, then of green, then of blue; none if the colours do
+    # not change with the view.
+    harmonics: tuple[str, ...] = ()
 
     @staticmethod
     def find(fields: Iterable[tuple[str, str]]) -> PlyLayout:
@@ -97,6 +102,7 @@ class PlyLayout:
             largest_opacity=largest_opacity,
             scales=tuple(stored_names[name] for name in scale_names),
             quats=tuple(stored_names[name] for name in quat_names),
+            harmonics=() if is_plain_color else view_harmonics(stored_names),
         )
 
     @property
@@ -121,6 +127,11 @@ class PlyLayout:
         if self.largest_color is None:
             return colors
         return (colors / np.float32(self.largest_color) - np.float32(0.5)) / np.float32(SH_C0)
+
+    def read_view_harmonics(self, rows: NDArray[Any]) -> Floats:
+        """Return the coefficients [N, K, 3] of the K harmonics of degree 1 and higher."""
+        stored = _stack(rows, self.harmonics)  # [3·K, N]
+        return stored.reshape(3, -1, len(rows)).transpose(2, 1, 0)
 
     def read_logits(self, rows: NDArray[Any]) -> Floats:
         """Return the logits [N] of opacities."""
@@ -150,6 +161,24 @@ class PlyLayout:
         if not self.quats:
             return np.repeat(np.array([[1], [0], [0], [0]], np.float32), len(rows), axis=1)
         return _stack(rows, self.quats)
+
+
+def view_harmonics(stored_names: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the stored names of the harmonics of the degrees 1 to 3 at most; none if incomplete.
+
+    Args:
+        stored_names: the name of each property in the file by its plain name. Coefficients are
+            called f_rest_0, f_rest_1, …: all of red, then all of green, then all of blue.
+    """
+    total = sum(name.startswith("f_rest_") for name in stored_names)
+    count = total // 3  # for each colour
+    degree = math.isqrt(count + 1) - 1
+    is_complete = all(f"f_rest_{index}" in stored_names for index in range(total))
+    if not is_complete or total != 3 * ((degree + 1) ** 2 - 1):
+        return ()
+    kept_count = HARMONICS_COUNTS[min(degree, MAX_DEGREE)]
+    indices = [color * count + index for color in range(3) for index in range(kept_count)]
+    return tuple(stored_names[f"f_rest_{index}"] for index in indices)
 
 
 def plain_name(name: str) -> str:

@@ -12,6 +12,7 @@ import torch
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.core.spherical_harmonics import degree_of_count
 from spackle.formats.gaussian_columns import GaussianColumns
 
 
@@ -24,6 +25,14 @@ def left_out_note(broken_count: int) -> str:
     return f"{broken_count:,} Gaussians that are not finite are left out"
 
 
+def harmonics_loss(degree: int, kept_degree: int = 0) -> str:
+    """The words for spherical harmonics that are left out above `kept_degree`."""
+    effect = "colours do not change with the view"
+    if kept_degree > 0:
+        effect = f"those up to degree {kept_degree} are kept"
+    return f"spherical harmonics of degree {degree} are dropped: {effect}"
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DecodedScene:
     """What a reader finds in a file; all but the Gaussians may be unknown."""
@@ -31,7 +40,7 @@ class DecodedScene:
     columns: GaussianColumns
     format: str  # with the version, such as "SPZ 3"
     writer: str | None = None  # the program that wrote the file, as the file names it
-    # The highest degree of the file's spherical harmonics. Those above degree 0 are not read.
+    # The highest degree of the file's spherical harmonics. Those above degree 3 are not read.
     harmonics_degree: int = 0
     # What else was left out or assumed, each in a few words for the user.
     notes: tuple[str, ...] = ()
@@ -56,7 +65,7 @@ class SceneFile:
     is_metric: bool = False
     format: str = ""  # with the version, such as "SPZ 3"
     writer: str | None = None  # the program that wrote the file, as the file names it
-    # The highest degree of the file's spherical harmonics. Those above degree 0 are not read.
+    # The highest degree of the file's spherical harmonics. Those above degree 3 are not read.
     harmonics_degree: int = 0
     # What else was left out or assumed, each in a few words for the user.
     notes: tuple[str, ...] = ()
@@ -66,11 +75,9 @@ class SceneFile:
     def losses(self) -> list[str]:
         """What was left out or assumed when the file was read, each in a few words."""
         losses = list(self.notes)
-        if self.harmonics_degree > 0:
-            losses.append(
-                f"spherical harmonics of degree {self.harmonics_degree} are dropped: "
-                "colours do not change with the view"
-            )
+        kept_degree = degree_of_count(self.gaussians.harmonics_count)
+        if self.harmonics_degree > kept_degree:
+            losses.append(harmonics_loss(self.harmonics_degree, kept_degree))
         return losses
 
     @property

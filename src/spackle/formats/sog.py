@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from spackle.formats.gaussian_columns import Floats, GaussianColumns
+from spackle.formats.palette import palette_labels
 from spackle.formats.quantization import (
     MAX_DISTANCE_RATIO,
     components_to_fractions,
@@ -49,6 +50,9 @@ FIRST_LARGEST_COMPONENT_CODE = 252
 # `exact` keeps the colours of pixels whose alpha is 0. A slower method saves little.
 WEBP_OPTIONS: dict[str, Any] = {"lossless": True, "exact": True, "quality": 25, "method": 1}
 
+MAX_PALETTE_ENTRIES = 1 << 16  # of harmonics; an entry's number has 16 bits
+PALETTE_COLUMNS = 64  # entries of harmonics in a row of the image of their palette
+
 META_NAME = "meta.json"  # the file that describes the images
 
 # A constant time for files in the archive, so that the same scene gives the same bytes.
@@ -60,7 +64,7 @@ def encode_sog(scene: SceneFile) -> bytes:
 
     The order of the Gaussians and the axes stay the same. A coordinate has 16 bits on a
     logarithmic scale, whose steps are small near 0. A scale or colour is a byte, the index of a
-    value in a codebook.
+    value in a codebook. Gaussians with similar harmonics share them: a palette has at most 65,536.
 
     Raises:
         InputError: there are no Gaussians, or more than the images can hold.
@@ -85,7 +89,7 @@ def encode_sog(scene: SceneFile) -> bytes:
         columns = shrink_distant(columns, farthest)
     positions, low, high = _quantize_positions(columns.means)
     scale_book, scale_codes = codebook(columns.log_scales)
-    color_book, color_codes = codebook(columns.harmonics)
+    color_book, color_codes = codebook(columns.constant_harmonics)
     asset: dict[str, Any] = {"generator": "Spackle"}
     if length_factor != 1:
         asset[LENGTH_FACTOR_KEY] = length_factor
@@ -115,10 +119,47 @@ def encode_sog(scene: SceneFile) -> bytes:
         "quats.webp": _encode_rotations(columns.quats),
         "sh0.webp": np.concatenate([color_codes, opacities], axis=1),
     }
-    members = {META_NAME: json.dumps(meta, allow_nan=False).encode()}
-    for name, rgba in pixels.items():
-        members[name] = _encode_webp(rgba, width)
+    images = {name: _encode_webp(rgba, width) for name, rgba in pixels.items()}
+    if columns.harmonics is not None:
+        palette, palette_images = _encode_harmonics(columns.harmonics, width)
+        palette["bands"] = columns.harmonics_degree
+        meta["shN"] = palette
+        images |= palette_images
+    members = {META_NAME: json.dumps(meta, allow_nan=False).encode(), **images}
     return _zip_members(members)
+
+
+def _encode_harmonics(harmonics: Floats, width: int) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Encode coefficients [N, K, 3] by a palette: its description, and two images by name.
+
+    `width` is that of the image with the Gaussians' numbers in the palette.
+    """
+    count, harmonics_count, _ = harmonics.shape
+    labels = palette_labels(harmonics.reshape(count, -1), MAX_PALETTE_ENTRIES)  # [N]
+    entry_count = int(labels.max()) + 1
+    order = np.argsort(labels, kind="stable")
+    starts = np.searchsorted(labels[order], np.arange(entry_count))
+    sizes = np.diff(np.append(starts, count))[:, None]
+    sums = np.add.reduceat(harmonics.reshape(count, -1)[order], starts, axis=0, dtype=np.float64)
+    entries = (sums / sizes).astype(np.float32)  # [P, 3·K], the mean of those that share an entry
+
+    book, codes = codebook(entries.reshape(-1, 3))
+    centroids = np.full((len(codes), 4), 255, np.uint8)
+    centroids[:, :3] = codes
+    label_pixels = np.zeros((count, 4), np.uint8)
+    label_pixels[:, 0] = labels & 255
+    label_pixels[:, 1] = labels >> 8
+    label_pixels[:, 3] = 255
+    description = {
+        "count": entry_count,
+        "codebook": book.tolist(),
+        "files": ["shN_centroids.webp", "shN_labels.webp"],
+    }
+    images = {
+        "shN_centroids.webp": _encode_webp(centroids, PALETTE_COLUMNS * harmonics_count, 1),
+        "shN_labels.webp": _encode_webp(label_pixels, width),
+    }
+    return description, images
 
 
 def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
@@ -192,10 +233,13 @@ def _encode_rotations(quats: Floats) -> NDArray[np.uint8]:
     return np.concatenate([other_codes, largest_codes], axis=1).astype(np.uint8)
 
 
-def _encode_webp(rgba: NDArray[np.uint8], width: int) -> bytes:
-    """Encode pixels [N, 4], row by row, as an image; unused pixels at the end are black."""
-    # Both sides are multiples of four, as in the files of splat-transform, the format's program.
-    height = math.ceil(len(rgba) / width / 4) * 4
+def _encode_webp(rgba: NDArray[np.uint8], width: int, row_unit: int = 4) -> bytes:
+    """Encode pixels [N, 4], row by row, as an image; unused pixels at the end are black.
+
+    The number of rows is a multiple of `row_unit`: of four for Gaussians, as in the files of
+    splat-transform, the format's program.
+    """
+    height = math.ceil(len(rgba) / width / row_unit) * row_unit
     pixels = np.zeros((height * width, 4), np.uint8)
     pixels[:, 3] = 255  # opaque
     pixels[: len(rgba)] = rgba

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.core.image_files import open_image
-from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
+from spackle.core.spherical_harmonics import HARMONICS_COUNTS
+from spackle.formats.gaussian_columns import (
+    Floats,
+    GaussianColumns,
+    colors_of_harmonics,
+    harmonics_to_srgb,
+)
 from spackle.formats.quantization import (
     check_length_factor,
     codes_to_fractions,
@@ -29,6 +35,7 @@ from spackle.formats.sog import (
     MAX_IMAGE_SIDE_PX,
     MAX_POSITION_CODE,
     META_NAME,
+    PALETTE_COLUMNS,
 )
 from spackle.runtime.errors import short_repr
 
@@ -64,6 +71,9 @@ def read_sog(path: Path) -> DecodedScene:
         (scale_codes,) = _read_images(read_member, meta["scales"]["files"], count)
         (rotation_codes,) = _read_images(read_member, meta["quats"]["files"], count)
         (color_codes,) = _read_images(read_member, meta["sh0"]["files"], count)
+        view_harmonics = None
+        if meta.get("shN") is not None:
+            view_harmonics = _read_harmonics(read_member, meta["shN"], count)
 
     position_codes = high_bytes[:, :3] * np.uint32(256) + low_bytes[:, :3]
     opacities = codes_to_fractions(color_codes[:, 3], 255)
@@ -82,7 +92,8 @@ def read_sog(path: Path) -> DecodedScene:
         quats=_decode_rotations(rotation_codes),
         log_scales=log_scales,
         opacities=opacities,
-        srgb=np.clip(harmonics_to_srgb(harmonics), 0, 1),
+        srgb=colors_of_harmonics(harmonics_to_srgb(harmonics), 0 if view_harmonics is None else 1),
+        harmonics=view_harmonics,
     )
     return DecodedScene(
         columns=columns.scaled(1 / _length_factor(meta)),
@@ -90,6 +101,48 @@ def read_sog(path: Path) -> DecodedScene:
         writer=_generator(meta),
         harmonics_degree=_harmonics_degree(meta.get("shN")),
     )
+
+
+def _read_harmonics(
+    read_member: ReadMember, palette: Mapping[str, Any], count: int
+) -> Floats | None:
+    """Read the coefficients [N, K, 3] of K harmonics; None if there are none.
+
+    Gaussians have a number of a palette's entry, whose coefficients are pixels of an image: K in a
+    row for each entry, 64 entries side by side.
+
+    Args:
+        read_member: reads a file of the scene.
+        palette: the part of a description about harmonics above degree 0.
+        count: N.
+
+    Raises:
+        ValueError: the image of the palette has another width.
+    """
+    centroids_name, labels_name = palette["files"]
+    with open_image(io.BytesIO(read_member(centroids_name)), ("WEBP", "PNG")) as image:
+        width, height = image.size
+    harmonics_count = width // PALETTE_COLUMNS
+    if harmonics_count == 0:
+        return None
+    if harmonics_count not in HARMONICS_COUNTS or width % PALETTE_COLUMNS:
+        raise ValueError(f"{centroids_name} is {width} pixels wide: no palette of harmonics")
+
+    entry_count = PALETTE_COLUMNS * height
+    (codes,) = _read_images(read_member, [centroids_name], entry_count * harmonics_count)
+    if "codebook" in palette:
+        coefficients = _look_up_codes(codes[:, :3], palette["codebook"])
+    else:  # version 1 has two bounds for all
+        low = np.float32(palette["mins"])
+        high = np.float32(palette["maxs"])
+        coefficients = low + (high - low) * codes_to_fractions(codes[:, :3], 255)
+    (label_codes,) = _read_images(read_member, [labels_name], count)
+    labels = label_codes[:, 1] * np.uint32(256) + label_codes[:, 0]
+    if labels.max() >= entry_count:
+        raise ValueError(f"entry {labels.max()} of a palette of {entry_count}")
+    entries = coefficients.reshape(entry_count, harmonics_count, 3)
+    harmonics: Floats = entries[labels]
+    return harmonics
 
 
 def _check_meta(meta: Any) -> None:

@@ -17,12 +17,12 @@ SPLAT_ROW = np.dtype(
 def encode_splat(scene: SceneFile) -> bytes:
     """Encode a scene as a .splat file; the order of the Gaussians and the axes stay the same.
 
-    Colours, opacities and rotations are rounded to bytes.
+    Colours, opacities and rotations are rounded to bytes; colours cannot change with the view.
 
     Raises:
         ValueError: a Gaussian is not finite.
     """
-    columns = GaussianColumns.from_gaussians(scene.gaussians)
+    columns = GaussianColumns.from_gaussians(scene.gaussians).without_harmonics()
     rgba = np.concatenate([columns.srgb, columns.opacities[:, None]], axis=1)  # [N, 4]
 
     rows = np.empty(len(scene.gaussians), SPLAT_ROW)

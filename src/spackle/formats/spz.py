@@ -1,18 +1,27 @@
 """SPZ, Niantic's compressed format: 20 bytes for each Gaussian, then compressed.
 
+Harmonics take 9, 24 or 45 bytes more.
+
 `encode_spz` writes version 3, `encode_spz_4` version 4; `decode_spz` reads the versions 1 to 4.
 """
 
 from __future__ import annotations
 
 import bisect
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spackle.core.gaussians import Gaussians
-from spackle.formats.gaussian_columns import SH_C0, Floats, GaussianColumns
+from spackle.core.spherical_harmonics import HARMONICS_COUNTS
+from spackle.formats.gaussian_columns import (
+    SH_C0,
+    Floats,
+    GaussianColumns,
+    colors_of_harmonics,
+)
 from spackle.formats.quantization import (
     MIN_LENGTH,
     codes_to_fractions,
@@ -27,6 +36,7 @@ from spackle.formats.spz_container import (
     MAGIC,
     MAX_COUNT,
     SpzHeader,
+    SpzParts,
     deflate,
     pack_parts,
     unpack_parts,
@@ -55,6 +65,11 @@ SCALE_STEPS = 16
 # The three smaller components of a quaternion, times √2, have a sign and 9 bits each.
 MAX_COMPONENT_CODE = 511
 COMPONENT_SIGN_BIT = 512
+
+# A byte of a harmonic's coefficient c is 128 + 128 c. It is rounded to multiples of HARMONIC_STEP;
+# Niantic's library takes steps of 8 (degree 1) and 16, which are visible.
+HARMONIC_ONE = 128
+HARMONIC_STEP = 2
 
 # Where the axes of a file point, by their number in an extension. The usual ones are RUB: x right,
 # y up, z back.
@@ -127,7 +142,7 @@ def _encode(scene: SceneFile, version: int) -> bytes:
     grid of `spz_grid`. A Gaussian outside of the grid is moved towards the origin and shrunk
     in proportion, which does not change the view from the origin. The format has no sizes below
     0.00005 or above 380: a scene that is not in metres is stored in another unit, and an
-    extension, which other readers skip, says which.
+    extension, which other readers skip, says which. Harmonics between -1 and 1 are kept.
 
     Raises:
         InputError: there are more Gaussians than readers accept.
@@ -147,11 +162,17 @@ def _encode(scene: SceneFile, version: int) -> bytes:
         magic=MAGIC,
         version=version,
         gaussian_count=count,
-        harmonics_degree=0,
+        harmonics_degree=columns.harmonics_degree,
         fraction_bits=fraction_bits,
         flags=0,
         frame_count=0,
     )
+
+    # Harmonics have a size of their own, which coarser other values would not change much.
+    harmonics = b""
+    if columns.harmonics is not None:
+        harmonics = _encode_harmonics(columns.harmonics).tobytes()
+        columns = dataclasses.replace(columns, harmonics=None)
 
     # ROUNDINGS go from fine to coarse. The first one with which samples of the Gaussians get small
     # enough may be too fine for the whole file; then coarser ones follow.
@@ -160,10 +181,32 @@ def _encode(scene: SceneFile, version: int) -> bytes:
     first_index = _finest_rounding_of_samples(columns, fraction_bits)
     for rounding in ROUNDINGS[first_index:]:
         sections = _encode_sections(columns, fraction_bits, rounding)
+        if harmonics:
+            return pack_parts(header, [*sections, harmonics], grid.length_factor)
         data = pack_parts(header, sections, grid.length_factor)
         if len(data) <= max_bytes:
             break
     return data
+
+
+def _encode_harmonics(harmonics: Floats) -> NDArray[np.uint8]:
+    """Return coefficients [N, K, 3] as bytes: 128 + 128 c, rounded to even numbers."""
+    steps = np.round(harmonics * np.float32(HARMONIC_ONE / HARMONIC_STEP))
+    rounded = np.clip(steps * HARMONIC_STEP + HARMONIC_ONE, 0, 255)
+    codes: NDArray[np.uint8] = rounded.astype(np.uint8)
+    return codes
+
+
+def _decode_harmonics(parts: SpzParts) -> Floats | None:
+    """Return the coefficients [N, K, 3] of degree 1 to 3, in the file's axes; None without any."""
+    if parts.header.harmonics_degree == 0:
+        return None
+    codes = parts.harmonics.reshape(len(parts.harmonics), -1, 3)
+    kept_codes: Floats = codes[:, : HARMONICS_COUNTS[-1]].astype(np.float32)
+    if parts.harmonics_bounds is None:
+        return kept_codes / np.float32(HARMONIC_ONE) - np.float32(1)
+    low, high = parts.harmonics_bounds
+    return np.float32(low) + kept_codes * np.float32((high - low) / 255)
 
 
 def spz_grid(gaussians: Gaussians) -> SpzGrid:
@@ -325,7 +368,7 @@ def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
 
 
 def decode_spz(data: bytes) -> DecodedScene:
-    """Decode an SPZ file, with y down and z forward, and colours of degree 0.
+    """Decode an SPZ file, with y down and z forward, and harmonics up to degree 3.
 
     Raises:
         UnsupportedSceneError: the file is of an unknown version.
@@ -353,7 +396,8 @@ def decode_spz(data: bytes) -> DecodedScene:
         quats=quats,
         log_scales=codes_to_fractions(parts.scales, SCALE_STEPS) + MIN_LOG_SCALE,
         opacities=codes_to_fractions(parts.opacities[:, 0], 255),
-        srgb=np.clip(srgb, 0, 1),
+        srgb=colors_of_harmonics(srgb, parts.header.harmonics_degree),
+        harmonics=_decode_harmonics(parts),
     )
     return DecodedScene(
         columns=_in_opencv_axes(columns, parts.axes).scaled(1 / parts.length_factor),

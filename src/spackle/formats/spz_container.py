@@ -44,9 +44,11 @@ COORDINATE_SYSTEM = 0xADBE0003  # kind of the extension that names the axes of t
 # Kind of the extension in which Spackle states by what all lengths were multiplied: a float64.
 LENGTH_FACTOR = 0x53504B01  # "SPK", and a number of ours
 LENGTH_FACTOR_FORMAT = struct.Struct("<d")
+# Kind of the extension that says between which bounds the bytes of harmonics lie: bits of degree 1
+# and of the others, lower and upper bound.
+HARMONICS_BOUNDS = 0xADBE0001
+HARMONICS_BOUNDS_FORMAT = struct.Struct("<BBff")
 MAX_EXTENSION_BYTES = 1 << 16  # of all extensions of a file, more than those that are known need
-
-MAX_SKIPPED_BYTES = 1 << 20  # of a block that is inflated and forgotten
 
 # Arguments of zlib: the container of gzip, the largest window, the most memory.
 GZIP_WINDOW_BITS = 16 + 15
@@ -68,7 +70,7 @@ class SpzHeader(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpzParts:
-    """The decompressed content of an SPZ file with N Gaussians, without spherical harmonics."""
+    """The decompressed content of an SPZ file with N Gaussians."""
 
     header: SpzHeader
     positions: NDArray[np.uint8]  # [N, 9], in version 1 [N, 6]
@@ -76,6 +78,9 @@ class SpzParts:
     colors: NDArray[np.uint8]  # [N, 3]
     scales: NDArray[np.uint8]  # [N, 3]
     rotations: NDArray[np.uint8]  # [N, 4], in versions 1 and 2 [N, 3]
+    harmonics: NDArray[np.uint8]  # [N, 3·K] for K harmonics: red, green, blue of each
+    # The numbers for which the bytes 0 and 255 of harmonics stand, if an extension says so.
+    harmonics_bounds: tuple[float, float] | None = None
     axes: int = 0  # the number of the file's axes, if an extension names them; 0 for the usual ones
     length_factor: float = 1.0  # by which the scene was multiplied, if an extension says it
 
@@ -85,7 +90,7 @@ def pack_parts(header: SpzHeader, parts: Sequence[bytes], length_factor: float =
 
     Args:
         header: of the file; its number of frames is filled in here.
-        parts: positions, opacities, colours, scales and rotations.
+        parts: positions, opacities, colours, scales, rotations, and harmonics if there are any.
         length_factor: by which all lengths were multiplied; an extension states it unless it is 1.
     """
     extensions = b""
@@ -118,7 +123,7 @@ def deflate(data: bytes) -> bytes:
 
 
 def unpack_parts(data: bytes) -> SpzParts:
-    """Decompress an SPZ file of any known version, but for its spherical harmonics.
+    """Decompress an SPZ file of any known version.
 
     No more bytes are decompressed than the header announces, because a small damaged or hostile
     file could otherwise fill the memory.
@@ -146,7 +151,7 @@ def _unpack_gzip(data: bytes) -> SpzParts:
         raise ValueError(f"version {header.version} within gzip")
     _check_header(header, len(data))
 
-    widths = part_widths(header.version)
+    widths = part_widths(header)
     body_bytes = header.gaussian_count * sum(widths)
     # For zlib, the limit 0 would mean no limit.
     body = inflater.decompress(inflater.unconsumed_tail, max(1, body_bytes))
@@ -159,11 +164,6 @@ def _unpack_gzip(data: bytes) -> SpzParts:
     if not header.flags & HAS_EXTENSIONS:
         return parts
 
-    # Extensions come after the spherical harmonics, which are inflated and forgotten.
-    harmonics_bytes = header.gaussian_count * 3 * harmonics_count(header.harmonics_degree)
-    for start in range(0, harmonics_bytes, MAX_SKIPPED_BYTES):
-        block_bytes = min(MAX_SKIPPED_BYTES, harmonics_bytes - start)
-        inflater.decompress(inflater.unconsumed_tail, block_bytes)
     extensions = inflater.decompress(inflater.unconsumed_tail, MAX_EXTENSION_BYTES)
     return _with_extensions(parts, extensions)
 
@@ -174,12 +174,14 @@ def _unpack_frames(data: bytes) -> SpzParts:
     _check_header(header, len(data))
     (table_start,) = HEADER_END.unpack_from(data, HEADER.size)
 
-    widths = part_widths(header.version)
-    if header.frame_count < len(widths):
-        raise ValueError(f"{header.frame_count} of {len(widths)} attributes are there")
+    widths = part_widths(header)
+    # A scene without harmonics may leave their empty frame out.
+    needed_count = sum(width > 0 for width in widths)
+    if header.frame_count < needed_count:
+        raise ValueError(f"{header.frame_count} of {needed_count} attributes are there")
     frame_start = table_start + header.frame_count * TABLE_ROW.size
     parts = []
-    for index, width in enumerate(widths):
+    for index, width in enumerate(widths[:needed_count]):
         row_start = table_start + index * TABLE_ROW.size
         frame_bytes, part_bytes = TABLE_ROW.unpack_from(data, row_start)
         if part_bytes != header.gaussian_count * width:
@@ -190,6 +192,8 @@ def _unpack_frames(data: bytes) -> SpzParts:
             raise ValueError(f"a part ends after {len(part):,} of {part_bytes:,} bytes")
         parts.append(np.frombuffer(part, np.uint8))
         frame_start += frame_bytes
+    if needed_count < len(widths):
+        parts.append(np.empty(0, np.uint8))
 
     extensions = b""
     if header.flags & HAS_EXTENSIONS:
@@ -198,10 +202,10 @@ def _unpack_frames(data: bytes) -> SpzParts:
 
 
 def _with_extensions(parts: SpzParts, records: bytes) -> SpzParts:
-    """Return the content with the axes and the unit that extensions give; others are skipped.
+    """Return the content with what extensions say of axes, unit and harmonics; others are skipped.
 
     Args:
-        parts: the content, with the usual axes and unit.
+        parts: the content, with the usual axes, unit and bounds of harmonics.
         records: the extensions; each begins with its kind and its number of bytes.
 
     Raises:
@@ -218,6 +222,9 @@ def _with_extensions(parts: SpzParts, records: bytes) -> SpzParts:
             (factor,) = LENGTH_FACTOR_FORMAT.unpack(content)
             check_length_factor(factor)
             parts = dataclasses.replace(parts, length_factor=factor)
+        elif kind == HARMONICS_BOUNDS and len(content) == HARMONICS_BOUNDS_FORMAT.size:
+            _, _, low, high = HARMONICS_BOUNDS_FORMAT.unpack(content)
+            parts = dataclasses.replace(parts, harmonics_bounds=(low, high))
         start += byte_count
     return parts
 
@@ -227,11 +234,11 @@ def harmonics_count(degree: int) -> int:
     return (degree + 1) ** 2 - 1
 
 
-def part_widths(version: int) -> tuple[int, int, int, int, int]:
-    """Return the bytes of a Gaussian's position, opacity, colour, scales and rotation."""
-    position_bytes = 6 if version == 1 else 9  # version 1 has half-precision numbers
-    rotation_bytes = 3 if version < 3 else 4
-    return position_bytes, 1, 3, 3, rotation_bytes
+def part_widths(header: SpzHeader) -> tuple[int, ...]:
+    """Return the bytes of a Gaussian's position, opacity, colour, scales, rotation, harmonics."""
+    position_bytes = 6 if header.version == 1 else 9  # version 1 has half-precision numbers
+    rotation_bytes = 3 if header.version < 3 else 4
+    return position_bytes, 1, 3, 3, rotation_bytes, 3 * harmonics_count(header.harmonics_degree)
 
 
 def _check_header(header: SpzHeader, file_bytes: int) -> None:
@@ -257,10 +264,10 @@ def _check_header(header: SpzHeader, file_bytes: int) -> None:
 
 def _named_parts(header: SpzHeader, parts: Sequence[NDArray[np.uint8]]) -> SpzParts:
     """Return flat parts as rows, one for each Gaussian, in the order of the file."""
-    widths = part_widths(header.version)
+    widths = part_widths(header)
     rows = [
         part.reshape(header.gaussian_count, width)
         for part, width in zip(parts, widths, strict=True)
     ]
-    positions, opacities, colors, scales, rotations = rows
-    return SpzParts(header, positions, opacities, colors, scales, rotations)
+    positions, opacities, colors, scales, rotations, harmonics = rows
+    return SpzParts(header, positions, opacities, colors, scales, rotations, harmonics)

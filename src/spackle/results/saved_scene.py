@@ -20,9 +20,10 @@ from spackle.core.camera import Camera
 from spackle.core.focal_length import ASSUMED_FOCAL_MM
 from spackle.core.gaussians import Gaussians
 from spackle.core.keyframes import PathError
+from spackle.core.spherical_harmonics import degree_of_count
 from spackle.formats import save_png
 from spackle.formats.html import single_html
-from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_content import SceneFile, harmonics_loss
 from spackle.formats.scene_files import Encoder, encoder_for, load_scene
 from spackle.formats.sog import META_NAME
 from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
@@ -49,6 +50,8 @@ def encode_page(file: SceneFile) -> bytes:
     return single_html(Scene.of_file(file).page(page_name(file.path)))
 
 
+# Formats in which a Gaussian has one colour.
+SUFFIXES_WITHOUT_HARMONICS = (".splat", ".html")
 PAGE_ENCODERS: dict[str, Encoder] = {".html": encode_page}
 
 
@@ -361,6 +364,10 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
         f"{output}: {count:,} Gaussians, {decimal(size)}, "
         f"{size / scene.byte_count:.0%} of the size of {scene.path.name}, {seconds:.1f} s"
     )
+
+    degree = degree_of_count(scene.gaussians.harmonics_count)
+    if degree > 0 and output.name.lower().endswith(SUFFIXES_WITHOUT_HARMONICS):
+        reporter.log(f"{output}: {harmonics_loss(degree)}")
 
     # SPZ rounds positions to a grid, which does not reach as far as some Gaussians of a sky lie.
     # The encoder moves them nearer and shrinks them by the same factor, so they look the same from
