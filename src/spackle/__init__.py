@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.formats import load_ply as load_ply
     from spackle.formats import save_ply as save_ply
     from spackle.pipeline import complete as complete
+    from spackle.pipeline import fill as fill
     from spackle.render import Renderer as Renderer
     from spackle.render import get_renderer as get_renderer
     from spackle.render.protocol import Rendering as Rendering
@@ -60,7 +61,7 @@ _NAMES_BY_MODULE = {
     "spackle.render": ("Renderer", "get_renderer"),
     "spackle.render.protocol": ("Rendering",),
     "spackle.residual": ("complete_view", "hole_area_ratio", "hole_mask"),
-    "spackle.pipeline": ("complete",),
+    "spackle.pipeline": ("complete", "fill"),
     "spackle.scene": ("Scene",),
     "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view"),
     "spackle.api": ("Spackle", "predict"),

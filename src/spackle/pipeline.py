@@ -535,6 +535,64 @@ def complete(
     )
 
 
+def fill(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    *,
+    network: ResidualNet | Literal["shipped"] | None = "shipped",
+    texture: str = "auto",
+    renderer: Renderer | None = None,
+    progress: Progress | None = None,
+) -> Gaussians:
+    """A scene of any program with Gaussians added where its cameras see holes.
+
+    The first Gaussians of the result are the given ones, bit for bit, with their harmonics; those
+    that were added come after them. Nothing that the first camera sees is hidden by them.
+
+    Args:
+        gaussians: the scene, in any frame.
+        cameras: the views to fill, in the scene's frame (x right, y down, z forward at each
+            camera). The first one stands for the photo of a scene that was made from a photo.
+        network: the network that improves the added Gaussians, by default Spackle's; None adds
+            them without a network.
+        texture: where the texture comes from, as `fill` of `complete`.
+        renderer: by default the best of this machine, on its GPU if it has one.
+        progress: called with (views done, all views).
+
+    Raises:
+        ValueError: there are no cameras.
+    """
+    if not cameras:
+        raise ValueError("`cameras` is empty: give the views to fill")
+
+    # Completion starts from a photo's camera at the world's origin.
+    to_first = cameras[0].world_to_camera.double()
+    from_first = torch.linalg.inv(to_first)
+    moved_cameras = [
+        dataclasses.replace(camera, world_to_camera=camera.world_to_camera.double() @ from_first)
+        for camera in cameras
+    ]
+    moved_cameras[0] = dataclasses.replace(
+        cameras[0], world_to_camera=torch.eye(4, dtype=torch.float64)
+    )
+    prediction = BasePrediction(
+        gaussians.transform(to_first),
+        moved_cameras[0].to(dtype=torch.float32),
+        notes={},
+        is_metric=False,
+    )
+    completed = complete(
+        prediction,
+        [camera.to(dtype=torch.float32) for camera in moved_cameras],
+        exact=True,
+        network=network,
+        fill=texture,
+        renderer=renderer,
+        progress=progress,
+    )
+    return Gaussians.cat([gaussians, completed.aux.transform(from_first)])
+
+
 def resolve_texture(fill: str) -> str:
     """Replace "auto" by "lama" if LaMa's weights have been downloaded, else by "exemplar".
 

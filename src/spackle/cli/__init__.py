@@ -26,6 +26,7 @@ from spackle.cli.demo import demo
 from spackle.cli.evaluate import evaluate
 from spackle.cli.export import export
 from spackle.cli.figures import figures
+from spackle.cli.fill import fill
 from spackle.cli.info import info
 from spackle.cli.messages import applications, with_flags
 from spackle.cli.options import INTERRUPTED, PAPER_PANEL
@@ -90,6 +91,7 @@ app = typer.Typer(
 app.command(short_help="Turn photos, or a clip, into completed scenes and videos")(predict)
 app.command(short_help="View a scene, or a photo that becomes one, in the browser")(view)
 app.command(short_help="Complete photos for programs, over HTTP")(serve)
+app.command(short_help="Fill holes of a scene that another program made")(fill)
 app.command(short_help="Render a saved scene as a video")(render)
 app.command(short_help="Write a scene for other viewers, or as one page to send")(export)
 app.command(short_help="Describe a scene, photo, depth map or clip")(info)

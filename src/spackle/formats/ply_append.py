@@ -1,0 +1,104 @@
+"""Add Gaussians to a PLY file of any program, without changing a bit of those that it holds."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from spackle.core.gaussians import Gaussians
+from spackle.formats.gaussian_columns import SH_C0, GaussianColumns
+from spackle.formats.ply import MAX_OPACITY, MIN_OPACITY
+from spackle.formats.ply_layout import NoGaussiansError, PlyLayout
+from spackle.formats.ply_tables import MAX_HEADER_BYTES, PlyElement, PlyTables
+
+
+def append_to_ply(source: str | os.PathLike[str], aux: Gaussians) -> bytes | None:
+    """The bytes of a PLY file with more Gaussians after its own, which keep their bytes.
+
+    All properties, comments and other tables of the file stay. Properties that are not a
+    Gaussian's position, colour, opacity or shape are 0 in the new rows. Harmonics that the file has
+    and the new Gaussians have not are 0, too.
+
+    Args:
+        source: a PLY file.
+        aux: the Gaussians to add, in the file's world.
+
+    Returns:
+        None if the file's layout cannot hold them: a text file, a compressed one, discs, balls,
+        colours that are linear or not harmonics, or fewer harmonics than the new Gaussians have.
+
+    Raises:
+        InputError: the file is no PLY file, or damaged.
+    """
+    tables = PlyTables(source)
+    vertices = tables.elements_named("vertex")
+    if tables.is_text or tables.elements_named("chunk") or len(vertices) != 1:
+        return None
+    vertex = vertices[0]
+    try:
+        layout = PlyLayout.find(vertex.fields)
+    except NoGaussiansError:
+        return None
+    has_linear_colors = any(element.name == "intrinsic" for element in tables.elements)
+    if not tables.has_known_place(vertex) or not _has_room(layout, aux) or has_linear_colors:
+        return None
+
+    content = Path(source).read_bytes()
+    rows_end = vertex.start_byte + vertex.row_count * np.dtype(vertex.fields).itemsize
+    header_end = tables.elements[0].start_byte
+    header = _longer_header(content[:header_end], vertex, len(aux))
+    new_rows = _rows_of(aux, vertex, layout)
+    return header + content[header_end:rows_end] + new_rows + content[rows_end:]
+
+
+def _has_room(layout: PlyLayout, aux: Gaussians) -> bool:
+    """Whether rows of a layout can hold Gaussians."""
+    has_whole_shape = len(layout.scales) == 3 and len(layout.quats) == 4
+    has_own_colors = layout.largest_color is None
+    has_own_opacity = layout.opacity is not None and layout.largest_opacity is None
+    has_harmonics = 3 * aux.harmonics_count <= len(layout.harmonics)
+    return has_whole_shape and has_own_colors and has_own_opacity and has_harmonics
+
+
+def _longer_header(header: bytes, vertex: PlyElement, count: int) -> bytes:
+    """The header of a file with `count` more vertices, and with a note where the new ones begin."""
+    total = vertex.row_count + count
+    longer = re.sub(
+        rb"(\n[ \t]*element[ \t]+vertex[ \t]+)\d+",
+        lambda match: match.group(1) + str(total).encode(),
+        header[:MAX_HEADER_BYTES],
+        count=1,
+    )
+    if b"comment spackle_base" in longer:  # of an earlier fill, whose additions are not the base
+        return longer
+    note = f"\ncomment spackle_base {vertex.row_count}".encode()
+    first_line, line_end, others = longer.partition(b"\n")
+    format_line, _, rest = others.partition(b"\n")
+    return first_line + line_end + format_line + note + b"\n" + rest
+
+
+def _rows_of(aux: Gaussians, vertex: PlyElement, layout: PlyLayout) -> bytes:
+    """The bytes of Gaussians as rows of a table."""
+    columns = GaussianColumns.from_gaussians(aux)
+    opacities = np.clip(columns.opacities, MIN_OPACITY, MAX_OPACITY)
+    rows = np.zeros(len(aux), vertex.fields)
+    for index, name in enumerate(layout.means):
+        rows[name] = columns.means[:, index]
+    for index, name in enumerate(layout.colors):
+        rows[name] = (columns.srgb[:, index] - np.float32(0.5)) / np.float32(SH_C0)
+    for index, name in enumerate(layout.scales):
+        rows[name] = columns.log_scales[:, index]
+    for index, name in enumerate(layout.quats):
+        rows[name] = columns.quats[:, index]
+    assert layout.opacity is not None
+    rows[layout.opacity] = np.log(opacities / (1 - opacities))
+    if columns.harmonics is not None:
+        by_color = columns.harmonics.transpose(2, 1, 0)  # [3, K, N]
+        count_in_file = len(layout.harmonics) // 3
+        for color in range(3):
+            for index, values in enumerate(by_color[color]):
+                rows[layout.harmonics[color * count_in_file + index]] = values
+    return rows.tobytes()
