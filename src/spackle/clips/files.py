@@ -79,8 +79,8 @@ def is_clip(path: Path) -> bool:
     A GIF with a single frame is a photo, and so is a file that cannot be read as a GIF.
     """
     suffix = path.suffix.lower()
-    if os.path.isdir(path):
-        return False
+    if path.exists() and not path.is_file():
+        return False  # a folder, or a named pipe, which would be waited for
     if suffix != ".gif":
         return suffix in CLIP_SUFFIXES or _begins_as_video(path)
     try:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import list_files
+from spackle.runtime.files import check_file, list_files
 
 HEAD_BYTES = 64  # the first bytes of a file, which tell its format
 EXPORT_ADVICE = "export it as JPEG, PNG, WebP, HEIC, AVIF or TIFF"
@@ -171,6 +171,7 @@ def _kind_of_brands(head: bytes) -> FileKind:
 
 def kind_of_file(path: str | os.PathLike[str]) -> FileKind:
     """The format of a file by its first bytes; InputError if the file cannot be read."""
+    check_file(path, "file")  # opening a named pipe would wait for somebody who writes into it
     with as_input_error(path, "cannot be read: {reason}", OSError), open(path, "rb") as file:
         return kind_of_bytes(file.read(HEAD_BYTES))
 
