@@ -57,10 +57,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 return index
         return len(journeys)
 
+    places = {item: place(item) for item in items}
     for item in items:
-        if place(item) < len(journeys):
+        if places[item] < len(journeys):
             item.add_marker("journey")
-    items.sort(key=place)
+    items.sort(key=places.__getitem__)
 
 
 settings.register_profile("repeat", derandomize=True, deadline=None)

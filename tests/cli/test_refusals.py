@@ -7,10 +7,22 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import DATA
 from helpers.command import FILES, SHORT, names_in, refuses, run
 from helpers.photos import write_photo
 from helpers.systems import needs_named_pipes
+
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.render import get_renderer
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kernels() -> None:
+    """Compiled kernels; otherwise a command says that they are compiled, in a line of its own."""
+    get_renderer("cpu").render(Gaussians.empty(), Camera(torch.eye(3), torch.eye(4), 16, 16))
+
 
 INPUTS = {"predict": ("photo.png", "--depth", "depth.npy"), "render": ("scene.ply",)}
 # Options of both commands, and a part of the error message.

@@ -11,14 +11,17 @@ import torch
 from helpers.scenes import random_gaussians, random_harmonics, same_bits
 from torch import Tensor
 
-from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.color import (
+    extended_linear_to_srgb,
+    extended_srgb_to_linear,
+    linear_to_srgb,
+    srgb_to_linear,
+)
 from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.core.spherical_harmonics import HARMONICS_COUNTS, harmonics_of, rotate_harmonics
 from spackle.core.view_colors import (
     changed_colors,
     color_change,
-    extended_linear_to_srgb,
-    extended_srgb_to_linear,
     view_colors,
 )
 
