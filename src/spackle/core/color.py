@@ -14,19 +14,48 @@ from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.runtime.kernels import kernel
 
+# sRGB (IEC 61966-2-1): a line below the knee, a power above it.
+LINEAR_KNEE = 0.0031308
+SRGB_KNEE = 0.04045
+SRGB_SLOPE = 12.92
+SRGB_OFFSET = 0.055
+SRGB_EXPONENT = 2.4
+
 
 def srgb_to_linear(srgb: Tensor) -> Tensor:
-    """Decode sRGB (IEC 61966-2-1) elementwise; values are clamped to 0..1 first."""
-    srgb = srgb.clamp(0, 1)
-    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    """Decode sRGB elementwise; values are clamped to 0..1 first."""
+    return _decode_positive(srgb.clamp(0, 1))
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
-    """Encode as sRGB (IEC 61966-2-1) elementwise; values are clamped to 0..1 first."""
-    linear = linear.clamp(0, 1)
+    """Encode linear RGB as sRGB elementwise; values are clamped to 0..1 first."""
+    return _encode_positive(linear.clamp(0, 1))
+
+
+def extended_srgb_to_linear(srgb: Tensor) -> Tensor:
+    """Decode sRGB elementwise, also outside of 0..1; odd around 0."""
+    sign = torch.ones_like(srgb).copysign(srgb.detach())
+    return sign * _decode_positive(sign * srgb)
+
+
+def extended_linear_to_srgb(linear: Tensor) -> Tensor:
+    """Encode linear RGB as sRGB elementwise, also outside of 0..1; odd around 0."""
+    sign = torch.ones_like(linear).copysign(linear.detach())
+    return sign * _encode_positive(sign * linear)
+
+
+def _decode_positive(srgb: Tensor) -> Tensor:
+    """Decode sRGB elementwise, of values that are at least 0."""
+    power = ((srgb + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** SRGB_EXPONENT
+    return torch.where(srgb <= SRGB_KNEE, srgb / SRGB_SLOPE, power)
+
+
+def _encode_positive(linear: Tensor) -> Tensor:
+    """Encode linear RGB as sRGB elementwise, of values that are at least 0."""
     # Without the clamp, the gradient of the unused branch would be infinite at zero.
-    power = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= 0.0031308, linear * 12.92, power)
+    root = linear.clamp_min(LINEAR_KNEE) ** (1 / SRGB_EXPONENT)
+    power = (1 + SRGB_OFFSET) * root - SRGB_OFFSET
+    return torch.where(linear <= LINEAR_KNEE, linear * SRGB_SLOPE, power)
 
 
 # The scale of depth is measured on a sample of the Gaussians and views, which is accurate enough.

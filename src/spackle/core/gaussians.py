@@ -161,6 +161,17 @@ class Gaussians:
         """Whether all numbers are finite."""
         return all(bool(torch.isfinite(tensor).all()) for tensor in self.tensors)
 
+    @property
+    def finite_rows(self) -> Tensor:
+        """[N] bool: the Gaussians all of whose numbers are finite."""
+        finite_by_field = []
+        for tensor in self.tensors:
+            is_finite = tensor.detach().isfinite()  # [N, ...], a Gaussian's numbers on all axes
+            if is_finite.ndim > 1:
+                is_finite = is_finite.flatten(1).all(1)  # [N]
+            finite_by_field.append(is_finite)
+        return torch.stack(finite_by_field).all(0)
+
     def covariances(self) -> Tensor:
         """World-space covariances Σ = R S Sᵀ Rᵀ, [N, 3, 3]."""
         factor = quat_to_matrix(self.quats) * self.scales[:, None, :]  # R S

@@ -6,14 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from spackle.core.color import extended_linear_to_srgb, extended_srgb_to_linear
 from spackle.core.spherical_harmonics import degree_of_count, harmonics_of
-
-# sRGB (IEC 61966-2-1): a line below the knee, a power above it.
-LINEAR_KNEE = 0.0031308
-SRGB_KNEE = 0.04045
-SLOPE = 12.92
-OFFSET = 0.055
-EXPONENT = 2.4
 
 
 def view_colors(means: Tensor, colors: Tensor, harmonics: Tensor, position: Tensor) -> Tensor:
@@ -49,18 +43,3 @@ def color_change(means: Tensor, harmonics: Tensor, position: Tensor) -> Tensor:
 def changed_colors(colors: Tensor, change: Tensor) -> Tensor:
     """Linear RGB [N, 3] of colours [N, 3] whose sRGB is changed, at least 0."""
     return extended_srgb_to_linear((extended_linear_to_srgb(colors) + change).clamp_min(0))
-
-
-def extended_linear_to_srgb(linear: Tensor) -> Tensor:
-    """Encode linear RGB as sRGB elementwise, also outside of 0..1; odd around 0."""
-    size = linear.abs()
-    # Without the clamp, the gradient of the unused branch would be infinite at zero.
-    power = (1 + OFFSET) * size.clamp_min(LINEAR_KNEE) ** (1 / EXPONENT) - OFFSET
-    return torch.where(size <= LINEAR_KNEE, linear * SLOPE, power * linear.sign())
-
-
-def extended_srgb_to_linear(srgb: Tensor) -> Tensor:
-    """Decode sRGB elementwise, also outside of 0..1; odd around 0."""
-    size = srgb.abs()
-    power = ((size + OFFSET) / (1 + OFFSET)) ** EXPONENT
-    return torch.where(size <= SRGB_KNEE, srgb / SLOPE, power * srgb.sign())

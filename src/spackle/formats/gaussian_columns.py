@@ -11,10 +11,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.color import (
+    extended_linear_to_srgb,
+    extended_srgb_to_linear,
+    linear_to_srgb,
+    srgb_to_linear,
+)
 from spackle.core.gaussians import Gaussians, quat_from_matrix, quat_multiply
 from spackle.core.spherical_harmonics import degree_of_count, rotate_harmonics
-from spackle.core.view_colors import extended_linear_to_srgb, extended_srgb_to_linear
 
 Floats = NDArray[np.float32]
 

@@ -17,9 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
-from spackle.core.color import srgb_to_linear
+from spackle.core.color import extended_srgb_to_linear, srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.view_colors import extended_srgb_to_linear
 from spackle.formats.camera_files import checked_camera
 from spackle.formats.compressed_ply import (
     HARMONICS_TABLE,
@@ -163,17 +162,23 @@ def _fill_table(table: Floats, columns: GaussianColumns) -> None:
     The columns are FIRST_PROPERTIES; all harmonics of red, then of green, then of blue; and
     LAST_PROPERTIES. Normals, the columns 3 to 5, are not written: the caller has set them to zero.
     """
-    opacities = np.clip(columns.opacities, MIN_OPACITY, MAX_OPACITY)
     table[:, 0:3] = columns.means  # x y z
     table[:, 6:9] = columns.constant_harmonics  # f_dc_0 f_dc_1 f_dc_2
     if columns.harmonics is not None:
         by_color = columns.harmonics.transpose(0, 2, 1)  # [N, 3, K]
         table[:, 9 : -len(LAST_PROPERTIES)] = by_color.reshape(len(table), -1)  # f_rest
     last_columns = table[:, -len(LAST_PROPERTIES) :]
-    # The logit. It is precise for opacities near 1, too, because 1 - opacity is exact there.
-    last_columns[:, 0] = np.log(opacities / (1 - opacities))
+    last_columns[:, 0] = stored_logits(columns.opacities)  # opacity
     last_columns[:, 1:4] = columns.log_scales  # scale_0 scale_1 scale_2
     last_columns[:, 4:8] = columns.quats  # rot_0 rot_1 rot_2 rot_3
+
+
+def stored_logits(opacities: Floats) -> Floats:
+    """The logits [N] of opacities [N], which are first moved a little away from 0 and 1."""
+    clipped = np.clip(opacities, MIN_OPACITY, MAX_OPACITY)
+    # Precise for opacities near 1, too, because 1 - opacity is exact there.
+    logits: Floats = np.log(clipped / (1 - clipped))
+    return logits
 
 
 def load_ply(path: StrPath) -> Gaussians:

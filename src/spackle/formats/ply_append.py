@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from spackle.core.gaussians import Gaussians
-from spackle.formats.gaussian_columns import SH_C0, GaussianColumns
-from spackle.formats.ply import MAX_OPACITY, MIN_OPACITY
+from spackle.formats.gaussian_columns import Floats, GaussianColumns
+from spackle.formats.ply import stored_logits
 from spackle.formats.ply_layout import NoGaussiansError, PlyLayout
 from spackle.formats.ply_tables import MAX_HEADER_BYTES, PlyElement, PlyTables
 
@@ -83,22 +84,24 @@ def _longer_header(header: bytes, vertex: PlyElement, count: int) -> bytes:
 def _rows_of(aux: Gaussians, vertex: PlyElement, layout: PlyLayout) -> bytes:
     """The bytes of Gaussians as rows of a table."""
     columns = GaussianColumns.from_gaussians(aux)
-    opacities = np.clip(columns.opacities, MIN_OPACITY, MAX_OPACITY)
     rows = np.zeros(len(aux), vertex.fields)
-    for index, name in enumerate(layout.means):
-        rows[name] = columns.means[:, index]
-    for index, name in enumerate(layout.colors):
-        rows[name] = (columns.srgb[:, index] - np.float32(0.5)) / np.float32(SH_C0)
-    for index, name in enumerate(layout.scales):
-        rows[name] = columns.log_scales[:, index]
-    for index, name in enumerate(layout.quats):
-        rows[name] = columns.quats[:, index]
+
+    def write(names: Sequence[str], values: Floats) -> None:
+        """Write the columns of values [N, k] into the properties of k names."""
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
+
+    write(layout.means, columns.means)
+    write(layout.colors, columns.constant_harmonics)
+    write(layout.scales, columns.log_scales)
+    write(layout.quats, columns.quats)
     assert layout.opacity is not None
-    rows[layout.opacity] = np.log(opacities / (1 - opacities))
+    rows[layout.opacity] = stored_logits(columns.opacities)
     if columns.harmonics is not None:
-        by_color = columns.harmonics.transpose(2, 1, 0)  # [3, K, N]
+        # The file may have harmonics of a higher degree; these stay 0.
+        count = columns.harmonics.shape[1]
         count_in_file = len(layout.harmonics) // 3
         for color in range(3):
-            for index, values in enumerate(by_color[color]):
-                rows[layout.harmonics[color * count_in_file + index]] = values
+            first = color * count_in_file
+            write(layout.harmonics[first : first + count], columns.harmonics[:, :, color])
     return rows.tobytes()

@@ -50,13 +50,7 @@ class DeviceGaussians:
         fields = [
             tensor.to(device, torch.float32, non_blocking=True) for tensor in gaussians.tensors
         ]
-        finite_by_field = []
-        for field in fields:
-            is_finite = field.detach().isfinite()  # [N, ...], a Gaussian's numbers on all axes
-            if is_finite.ndim > 1:
-                is_finite = is_finite.flatten(1).all(1)  # [N]
-            finite_by_field.append(is_finite)
-        finite = torch.stack(finite_by_field).all(0)
+        finite = Gaussians(*fields).finite_rows
         cleaned_fields = []
         for field in fields:
             further_axes = [1] * (field.ndim - 1)  # so that `finite` holds for all of a Gaussian

@@ -61,15 +61,8 @@ class ReferenceRenderer(Renderer):
 
 def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """The finite Gaussians at or beyond the near plane, sorted by their depth z."""
-    finite_by_field = []
-    for tensor in gaussians.tensors:
-        is_finite = tensor.detach().isfinite()  # [N, ...], the numbers of a Gaussian along all axes
-        if is_finite.ndim > 1:
-            is_finite = is_finite.flatten(1).all(dim=1)  # [N]
-        finite_by_field.append(is_finite)
-    finite = torch.stack(finite_by_field).all(dim=0)
     z = camera.to_camera(gaussians.means.detach())[:, 2]
-    drawable = gaussians.select(finite & (z >= near_plane([gaussians], camera)))
+    drawable = gaussians.select(gaussians.finite_rows & (z >= near_plane([gaussians], camera)))
 
     # Stable: Gaussians of equal depth keep their order, as in the fast renderers.
     z = camera.to_camera(drawable.means.detach())[:, 2]

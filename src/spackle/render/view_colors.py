@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from spackle.core.camera import Camera
+from spackle.core.color import SRGB_EXPONENT, SRGB_OFFSET
 from spackle.core.gaussians import Gaussians
 from spackle.core.spherical_harmonics import (
     C1,
@@ -28,13 +29,7 @@ from spackle.core.spherical_harmonics import (
     C3_OUTER,
     C3_SQUARES,
 )
-from spackle.core.view_colors import (
-    EXPONENT,
-    OFFSET,
-    changed_colors,
-    color_change,
-    view_colors,
-)
+from spackle.core.view_colors import changed_colors, color_change, view_colors
 from spackle.render.fast_math import (
     ENCODED_KNEE,
     SRGB_KNEE,
@@ -50,9 +45,9 @@ BLOCK_GAUSSIANS = 256  # their changes of colour fit into the first-level cache
 MAX_CHANGE = 1e30  # a larger sum of harmonics is treated like NaN
 
 # Numbers of the formulas in float32, for the kernel.
-K_OFFSET = np.float32(OFFSET)
-K_POWER = np.float32(EXPONENT)
-K_ROOT = np.float32(1 / EXPONENT)
+K_OFFSET = np.float32(SRGB_OFFSET)
+K_POWER = np.float32(SRGB_EXPONENT)
+K_ROOT = np.float32(1 / SRGB_EXPONENT)
 K_MAX = np.float32(MAX_CHANGE)
 K_1 = np.float32(C1)
 K_2_MIXED = np.float32(C2_MIXED)

@@ -10,6 +10,7 @@ import torch
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.formats.ply import encode_ply
 from spackle.formats.ply_append import append_to_ply
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import Encoder, encoder_for, load_scene
@@ -30,7 +31,6 @@ def fill_saved_scene(
     cameras_file: Path,
     reporter: Reporter,
     *,
-    texture: str = "auto",
     device: str = "auto",
 ) -> None:
     """Fill a scene where the cameras of a file see holes, and write it with the new Gaussians.
@@ -42,7 +42,6 @@ def fill_saved_scene(
         output: the file to write; its suffix sets the format.
         cameras_file: the views, in the scene's world; the first one stands for a photo.
         reporter: says what was left out, how much was filled, and what was written.
-        texture: where the texture comes from, see `pipeline.open_texture`.
         device: of the network and the renderer.
 
     Raises:
@@ -67,9 +66,9 @@ def fill_saved_scene(
         if before == 1:
             problem = f"no camera sees the scene {scene_file.name}"
             raise InputError(f"{cameras_file}: {problem}: give cameras of its world")
-        filled = fill(loaded.gaussians, cameras, texture=texture, renderer=renderer)
+        filled = fill(loaded.gaussians, cameras, renderer=renderer)
         after = _mean_hole_ratio(filled, cameras, renderer)
-        write_atomic(output, _encoded(loaded, filled, output, encode))
+        write_atomic(output, _encoded(loaded, filled, encode))
 
     aux_count = len(filled) - len(loaded.gaussians)
     holes = f"holes {before:.1%} -> {after:.2%} of {len(cameras)} views"
@@ -101,13 +100,10 @@ def _mean_hole_ratio(gaussians: Gaussians, cameras: list[Camera], renderer: Rend
     return sum(ratios) / len(ratios)
 
 
-def _encoded(loaded: SceneFile, filled: Gaussians, output: Path, encode: Encoder) -> bytes:
+def _encoded(loaded: SceneFile, filled: Gaussians, encode: Encoder) -> bytes:
     """The bytes of a filled scene; of a PLY, the rows of the file and then the new ones."""
     count = len(loaded.gaussians)
-    is_ply = output.name.lower().endswith(".ply") and not output.name.lower().endswith(
-        ".compressed.ply"
-    )
-    if is_ply and loaded.format == "PLY":
+    if encode is encode_ply and loaded.format == "PLY":
         aux = filled.select(slice(count, None)).with_harmonics_count(0)
         content = append_to_ply(loaded.path, aux)
         if content is not None:
