@@ -73,6 +73,33 @@ def test_holes_of_a_scene_in_its_own_world_are_filled() -> None:
         spackle.fill(given, [])
 
 
+def test_only_the_fillable_part_of_a_view_is_filled() -> None:
+    given, camera = scene(), CAMERAS[1]
+    alpha = CpuRenderer().render(given, camera).alpha
+    is_hole = alpha < 0.95
+    # The row that halves the holes.
+    middle = int((is_hole.sum(1).cumsum(0) < is_hole.sum() / 2).sum())
+    upper = torch.zeros_like(is_hole)
+    upper[:middle] = True
+
+    def fill(fillable: Tensor | None) -> Gaussians:
+        views = None if fillable is None else [None, fillable]
+        return spackle.fill(given, [CAMERAS[0], camera], network=None, fillable=views)
+
+    half = fill(upper)
+    still_hole = CpuRenderer().render(half, camera).alpha < 0.95
+    assert int(still_hole[:middle].sum()) <= 0.01 * int(is_hole.sum())
+    # Gaussians at the seam reach a few pixels beyond it.
+    lower = slice(middle + 6, None)
+    assert torch.equal(still_hole[lower], is_hole[lower])
+    assert same_bits(fill(torch.ones_like(upper)), fill(None))
+    assert len(fill(torch.zeros_like(upper))) == len(given)
+    with pytest.raises(ValueError, match="`fillable` has 1 grids for 2 cameras"):
+        spackle.fill(given, CAMERAS[:2], fillable=[None])
+    with pytest.raises(ValueError, match=r"expected bool of shape \(48, 64\)"):
+        spackle.fill(given, CAMERAS[:1], fillable=[upper.T])
+
+
 def write_cameras(path: Path, cameras: list[Camera]) -> Path:
     entries = [
         {

@@ -499,6 +499,7 @@ def complete(
     fill: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
+    fillable: Sequence[Tensor | None] | None = None,
 ) -> Scene:
     """Fill the holes of all views by one set of Gaussians, which are added to the base's.
 
@@ -511,6 +512,8 @@ def complete(
         fill: where the texture comes from, see `open_texture`; "none" keeps the holes.
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
+        fillable: for each view the pixels [H, W] bool whose holes may be filled, or None for all;
+            None: all holes of all views.
     """
     context = FillContext.of(
         prediction,
@@ -520,7 +523,7 @@ def complete(
     )
     views_to_fill = cameras if fill != "none" else ()
     start = time.perf_counter()
-    filled = fill_scene(context, views_to_fill, exact=exact, progress=progress)
+    filled = fill_scene(context, views_to_fill, exact=exact, progress=progress, fillable=fillable)
     report = SceneReport(
         focal_px=prediction.camera.focal[0],
         focal_source=prediction.lens_source or None,
@@ -543,6 +546,7 @@ def fill(
     texture: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
+    fillable: Sequence[Tensor | None] | None = None,
 ) -> Gaussians:
     """A scene of any program with Gaussians added where its cameras see holes.
 
@@ -558,12 +562,16 @@ def fill(
         texture: where the texture comes from, as `fill` of `complete`.
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
+        fillable: for each camera the pixels [H, W] bool whose holes may be filled, or None for
+            all; None: all holes of all cameras. Other holes stay open, and are no source of colour.
 
     Raises:
-        ValueError: there are no cameras.
+        ValueError: there are no cameras, or `fillable` does not fit them.
     """
     if not cameras:
         raise ValueError("`cameras` is empty: give the views to fill")
+    if fillable is not None:
+        _check_fillable(fillable, cameras)
 
     # Completion starts from a photo's camera at the world's origin.
     to_first = cameras[0].world_to_camera.double()
@@ -589,8 +597,24 @@ def fill(
         fill=texture,
         renderer=renderer,
         progress=progress,
+        fillable=fillable,
     )
     return Gaussians.cat([gaussians, completed.aux.transform(from_first)])
+
+
+def _check_fillable(fillable: Sequence[Tensor | None], cameras: Sequence[Camera]) -> None:
+    """ValueError unless there is one grid [H, W] of bools, or None, of the size of each camera."""
+    if len(fillable) != len(cameras):
+        raise ValueError(f"`fillable` has {len(fillable)} grids for {len(cameras)} cameras")
+    for grid, camera in zip(fillable, cameras, strict=True):
+        expected = (camera.height, camera.width)
+        if grid is None:
+            continue
+        if tuple(grid.shape) != expected or grid.dtype != torch.bool:
+            raise ValueError(
+                f"`fillable` has {grid.dtype} of shape {tuple(grid.shape)}, "
+                f"expected bool of shape {expected}"
+            )
 
 
 def resolve_texture(fill: str) -> str:

@@ -16,10 +16,10 @@ from spackle.core.camera import Camera
 from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
 from spackle.render.protocol import Rendering
-from spackle.residual.features import hole_area_ratio
+from spackle.residual.features import MASK_THRESHOLD, hole_area_ratio
 from spackle.runtime.progress import Progress
 from spackle.scene_fill.context import FillContext
-from spackle.scene_fill.hole_gaussians import fill_holes
+from spackle.scene_fill.hole_gaussians import cells_to_fill, fill_holes
 from spackle.scene_fill.incremental_renderer import IncrementalRenderer
 from spackle.scene_fill.occlusion_guard import OcclusionGuard, move_behind_surfaces
 from spackle.scene_fill.texture import exemplar_texture
@@ -95,6 +95,7 @@ def fill_scene(
     cameras: Sequence[Camera],
     exact: bool = False,
     progress: Progress | None = None,
+    fillable: Sequence[Tensor | None] | None = None,
 ) -> FilledScene:
     """Complete all views of a path with one set of Gaussians.
 
@@ -109,13 +110,17 @@ def fill_scene(
         exact: check every view, and complete every view that has a hole. Otherwise invisibly small
             holes may remain, and a view that shows the same as a checked one is not checked.
         progress: called with (number of views that are done, number of views).
+        fillable: for each view the pixels [H, W] bool whose holes may be filled, or None for all;
+            None: all holes of all views. Other holes stay as they are, and count as closed.
     """
     device = context.base.means.device
     if not cameras:
         return FilledScene(Gaussians.empty(device), {})
 
     # Everything is done on the renderer's device; the result returns to the base's device.
-    filling = _SceneFilling(context.on_renderer_device, cameras, exact)
+    filling = _SceneFilling(
+        context.on_renderer_device, cameras, exact, fillable or [None] * len(cameras)
+    )
     for count, index in enumerate(filling.order, start=1):
         if filling.needs_visit(index):
             filling.visit(index)
@@ -128,7 +133,13 @@ def fill_scene(
 class _SceneFilling:
     """The state of `fill_scene` between two views: what was added, which surfaces are guarded."""
 
-    def __init__(self, context: FillContext, cameras: Sequence[Camera], exact: bool) -> None:
+    def __init__(
+        self,
+        context: FillContext,
+        cameras: Sequence[Camera],
+        exact: bool,
+        fillable: Sequence[Tensor | None],
+    ) -> None:
         """Put the views in order, render the widest ones, and guard the surfaces they show.
 
         Args:
@@ -136,9 +147,11 @@ class _SceneFilling:
             cameras: the views.
             exact: visit every view, and leave no hole. Otherwise a view that shows the same as a
                 visited one is left out, and invisibly small holes stay open.
+            fillable: for each view the pixels [H, W] bool whose holes may be filled; None: all.
         """
         self.context = context
         self.cameras = cameras
+        self.fillable = fillable
         self.exact = exact
         self.max_hole_ratio = 0.0 if exact else INVISIBLE_HOLE_RATIO
 
@@ -181,7 +194,8 @@ class _SceneFilling:
         camera = self.cameras[index]
         base_rendering = self.base_renderings.pop(index, None)  # no longer needed afterwards
         rendering = self.renderer.render(camera, base_rendering)
-        hole_ratio = hole_area_ratio(rendering.alpha, self.context.threshold)
+        fillable = self.fillable[index]
+        hole_ratio = fillable_hole_ratio(rendering.alpha, fillable, self.context.threshold)
         if hole_ratio <= self.max_hole_ratio:
             self.pictures[index] = to_uint8(rendering.rgb)
             return
@@ -194,6 +208,7 @@ class _SceneFilling:
             self._other_guards(index),
             max_hole_ratio=self.max_hole_ratio,
             with_underlays=len(self.cameras) > 1,  # a single view shows nothing beneath its rims
+            fillable=fillable,
         )
         self.aux += filled.aux
         self.pending_underlays += [(index, underlay) for underlay in filled.underlays]
@@ -268,6 +283,7 @@ def _fill_in_passes(
     *,
     max_hole_ratio: float,
     with_underlays: bool,
+    fillable: Tensor | None = None,
 ) -> _FilledHoles:
     """Fill the holes of a view, render it, and fill the holes that stayed open.
 
@@ -281,6 +297,7 @@ def _fill_in_passes(
         guards: surfaces of other views, in front of which no new Gaussian may lie.
         max_hole_ratio: no further pass if at most this fraction of pixels are holes.
         with_underlays: also make Gaussians beneath the rims of the holes.
+        fillable: [H, W] bool, the pixels whose holes are filled; None: all. Other holes stay open.
     """
     aux: list[Gaussians] = []  # the Gaussians that each pass adds in the holes
     underlays: list[Gaussians] = []
@@ -289,18 +306,36 @@ def _fill_in_passes(
         # the second pass goes without it.
         pass_context = context if pass_index == 0 else context.without_network
         view = pass_context.view(rendering, camera)
-        if not bool(view.mask.any()):
+        mask = cells_to_fill(view, fillable)
+        if not bool(mask.any()):
             break
-        filling = fill_holes(pass_context, view, guards)
+        filling = fill_holes(pass_context, view, guards, mask)
         if with_underlays:
-            underlays.append(rim_underlay(view.mask, filling.surfaces, camera))
+            # Holes that stay open are no surface that could be continued.
+            underlays.append(rim_underlay(mask, filling.surfaces, camera, view.mask & ~mask))
         if not len(filling.gaussians):
             break
         aux.append(filling.gaussians)
         rendering = renderer.render_added(filling.gaussians)
-        if hole_area_ratio(rendering.alpha, context.threshold) <= max_hole_ratio:
+        hole_ratio = fillable_hole_ratio(rendering.alpha, fillable, context.threshold)
+        if hole_ratio <= max_hole_ratio:
             break
     return _FilledHoles(aux, underlays, rendering)
+
+
+def fillable_hole_ratio(
+    alpha: Tensor, fillable: Tensor | None, threshold: float = MASK_THRESHOLD
+) -> float:
+    """The fraction of a view's pixels that are holes and may be filled, 0..1.
+
+    Args:
+        alpha: [H, W] opacity; a hole pixel's is below the threshold.
+        fillable: [H, W] bool, the pixels that may be filled; None: all.
+        threshold: τ_α of eq. 4.
+    """
+    if fillable is not None:
+        alpha = torch.where(fillable.to(alpha.device), alpha, 1.0)
+    return hole_area_ratio(alpha, threshold)
 
 
 def farthest_first(differences: Tensor) -> list[int]:

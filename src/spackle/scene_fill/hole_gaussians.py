@@ -7,13 +7,14 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import BEHIND_SURFACE_RATIO, PIXEL_SIGMA_PX
 from spackle.residual.composer import compose
-from spackle.residual.features import CELL_PIXELS
+from spackle.residual.features import CELL, CELL_PIXELS, hole_mask
 from spackle.residual.initializer import InitialGaussians
 from spackle.scene_fill.context import FillContext
 from spackle.scene_fill.occlusion_guard import (
@@ -42,8 +43,26 @@ class HoleFilling:
     surfaces: InitialGaussians
 
 
+def cells_to_fill(view: SceneViewCompletion, fillable: Tensor | None) -> Tensor:
+    """[h, w] bool: the cells (2×2 pixels) of a view that touch a hole which may be filled.
+
+    Args:
+        view: the view, with its holes.
+        fillable: [H, W] bool, the pixels that may be filled; None: all of them.
+    """
+    if fillable is None:
+        return view.mask
+    alpha = view.rendering.alpha
+    hole = hole_mask(alpha, view.threshold) & fillable.to(alpha.device)
+    # An odd last row or column of pixels is a cell, too.
+    return max_pool2d(hole[None].float(), CELL, ceil_mode=True)[0] > 0
+
+
 def fill_holes(
-    context: FillContext, view: SceneViewCompletion, guards: Sequence[OcclusionGuard]
+    context: FillContext,
+    view: SceneViewCompletion,
+    guards: Sequence[OcclusionGuard],
+    mask: Tensor | None = None,
 ) -> HoleFilling:
     """Gaussians for all cells (2×2 pixels) of a view that touch a hole.
 
@@ -54,10 +73,12 @@ def fill_holes(
         context: network and texture, if any, and the precision of the network.
         view: the view, with its holes.
         guards: surfaces of other views, in front of which no new Gaussian may lie.
+        mask: [h, w] bool from `cells_to_fill`: the cells that get Gaussians; None: all with holes.
     """
-    mask = view.mask
+    if mask is None:
+        mask = view.mask
     eye = view.camera.position
-    deltas = view.deltas(context.network, context.precision)
+    deltas = view.deltas(context.network, context.precision, cells=mask)
     cells = view.gaussians(mask, deltas)
 
     # Gaussians that would hide a guarded surface move away along their line of sight. A single cell
@@ -71,10 +92,12 @@ def fill_holes(
     pixels = Gaussians.empty()
     if context.texture is not None:
         # The smooth colours of all cells: the new Gaussians' in holes, the rendered ones elsewhere.
+        # Holes that are not to be filled have their first guess, lest black bleeds out of them.
         structure = view.features.rgb.clone()
+        structure[view.mask] = view.initial.rgb[view.mask]
         structure[mask] = linear_to_srgb(cells.colors)
         picture = context.texture(view, structure)
-        pixels = _textured_pixels(view, deltas, picture, scales)
+        pixels = _textured_pixels(view, mask, deltas, picture, scales)
 
         # A cell's own Gaussian lies a little behind the Gaussians of its pixels, and has their mean
         # colour. So it shows only where they leave gaps.
@@ -87,24 +110,28 @@ def fill_holes(
     # texture, they are the first guess, unchanged.
     surfaces = view.initial
     if context.network is not None or context.texture is not None:
-        surfaces = _follow_beyond_photo(view, depths * scales, scales > 0)
+        surfaces = _follow_beyond_photo(view, mask, depths * scales, scales > 0)
     cells = move_from_eye(cells, eye, scales)
     return HoleFilling(Gaussians.cat([pixels, cells]), surfaces)
 
 
 def _textured_pixels(
-    view: SceneViewCompletion, deltas: Tensor | None, picture: Tensor, scales: Tensor
+    view: SceneViewCompletion,
+    mask: Tensor,
+    deltas: Tensor | None,
+    picture: Tensor,
+    scales: Tensor,
 ) -> Gaussians:
     """One Gaussian for each pixel of those hole cells whose four pixels differ in colour.
 
     Args:
         view: the view.
+        mask: [h, w] bool: the n hole cells that are filled.
         deltas: [h, w, 14] the network's changes of the initial Gaussians; None: no changes.
         picture: [2h, 2w, 3] sRGB of all pixels of the view.
         scales: [n] factors by which the Gaussians of the n hole cells move away from the eye; 0
             removes them.
     """
-    mask = view.mask
     cell_pixels = group_by_cell(picture)[mask]  # [n, 2, 2, 3] sRGB
     cell_means = cell_pixels.mean((1, 2), keepdim=True)
     differs = (cell_pixels - cell_means).abs().amax((1, 2, 3)) > UNIFORM_CELL_RANGE
@@ -124,7 +151,7 @@ def _textured_pixels(
 
 
 def _follow_beyond_photo(
-    view: SceneViewCompletion, depths: Tensor, is_kept: Tensor
+    view: SceneViewCompletion, mask: Tensor, depths: Tensor, is_kept: Tensor
 ) -> InitialGaussians:
     """The view's initial Gaussians, but beyond the photo's border at the depths of the new
     Gaussians.
@@ -136,13 +163,14 @@ def _follow_beyond_photo(
 
     Args:
         view: the view.
-        depths: [n] z of the new Gaussians of the n hole cells.
+        mask: [h, w] bool: the n hole cells that are filled.
+        depths: [n] z of the new Gaussians of these cells.
         is_kept: [n] bool, false for Gaussians that were removed.
     """
-    hole_inverse_depth = view.initial.inverse_depth[view.mask]  # [n]
-    follows = view.beyond_photo[view.mask] & is_kept
+    hole_inverse_depth = view.initial.inverse_depth[mask]  # [n]
+    follows = view.beyond_photo[mask] & is_kept
     inverse_depth = view.initial.inverse_depth.clone()
-    inverse_depth[view.mask] = torch.where(follows, 1 / depths, hole_inverse_depth)
+    inverse_depth[mask] = torch.where(follows, 1 / depths, hole_inverse_depth)
     return dataclasses.replace(view.initial, inverse_depth=inverse_depth)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
@@ -28,7 +29,12 @@ UNDERLAY_STRIDE = 3
 UNDERLAY_REACH_CELLS = UNDERLAY_STRIDE * GAUSSIAN_REACH_CELLS
 
 
-def rim_underlay(mask: Tensor, surfaces: InitialGaussians, camera: Camera) -> Gaussians:
+def rim_underlay(
+    mask: Tensor,
+    surfaces: InitialGaussians,
+    camera: Camera,
+    open_cells: Tensor | None = None,
+) -> Gaussians:
     """Gaussians behind the surfaces around a view's holes, which continue what fills the holes.
 
     From another view, a slit appears between the rim of a hole and the hole's filling. These
@@ -39,19 +45,24 @@ def rim_underlay(mask: Tensor, surfaces: InitialGaussians, camera: Camera) -> Ga
         surfaces: a surface point and its colour for each cell: of the filling in holes, of the
             visible surface elsewhere.
         camera: of the view.
+        open_cells: [h, w] bool: cells with holes that stay open, which have no surface; None: none.
     """
+    if open_cells is None:
+        open_cells = torch.zeros_like(mask)
+
     # An underlay is smooth: one large Gaussian for every third row and column of cells is enough.
     every_third = slice(None, None, UNDERLAY_STRIDE)
     coarse = (every_third, every_third)
-    around_holes = maximum_filter(mask, UNDERLAY_REACH_CELLS) & ~mask
+    around_holes = maximum_filter(mask, UNDERLAY_REACH_CELLS) & ~mask & ~open_cells
     rim = around_holes[coarse]
-    if not bool(rim.any()) or bool(rim.all()):
+    known = ~rim & ~open_cells[coarse]
+    if not bool(rim.any()) or not bool(known.any()):
         return Gaussians.empty()  # no rim, or nothing that could be continued beneath it
 
     # The cells at a rim are filled anew, from all other cells: from the holes' filling on one side,
     # from visible surfaces on the other. Of these two, the farther one counts.
     coarse_inverse_depth, coarse_rgb = fill_from_far_side(
-        surfaces.inverse_depth[coarse], surfaces.rgb[coarse].permute(2, 0, 1), ~rim
+        surfaces.inverse_depth[coarse], surfaces.rgb[coarse].permute(2, 0, 1), known
     )
 
     # The underlay must lie behind the surfaces of all cells that its Gaussians reach, also of those
