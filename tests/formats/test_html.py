@@ -13,12 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.scenes import box_before_wall
+from helpers.scenes import box_before_wall, random_harmonics
 
-from spackle.core.color import linear_to_srgb
+from spackle.core.color import extended_linear_to_srgb, linear_to_srgb
 from spackle.core.gaussians import Gaussians
 from spackle.core.gaussians import quat_to_matrix as matrices
-from spackle.formats.html import BYTES_PER_GAUSSIAN, encode_layer, page_scene, single_html
+from spackle.formats.html import (
+    BYTES_PER_GAUSSIAN,
+    encode_harmonics,
+    encode_layer,
+    page_scene,
+    single_html,
+)
 
 EVIL = "</script><b>&\"'\ud800"
 BOX = box_before_wall(width=64, height=48, focal=53)
@@ -70,6 +76,42 @@ def test_a_layer_is_read_back_as_precisely_as_it_says() -> None:
     scales = torch.cat([torch.full((1, 3), 1e-37), wanted.scales[1:]])
     assert encode_layer(dataclasses.replace(wanted, scales=scales))[2] < 0.11
     assert page_scene("alone", wanted, Gaussians.empty(), BOX.camera).files["aux.splats"] == b""
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_are_read_back_as_precisely_as_they_are_small(degree: int) -> None:
+    harmonics = random_harmonics(200, degree)
+    harmonics[0, 0] = 5  # a single large one does not cost the others their precision
+    colors = random_gaussians().colors * 3 - 1
+    data, limit = encode_harmonics(colors, harmonics)
+    assert limit == 5
+    planes = torch.frombuffer(bytearray(data), dtype=torch.uint8).view(-1, 200).float() - 128
+    values = (planes / 127) ** 2 * planes.sign() * limit
+    srgb = extended_linear_to_srgb(colors)
+    excess = torch.where(srgb < 0, srgb, (srgb - 1).clamp_min(0))
+    wanted = torch.cat([excess.T, harmonics.flatten(1).T])
+    steps = 2 * (wanted.abs() * limit).sqrt() / 127 + limit / 127**2
+    assert bool(((values - wanted).abs() <= 0.51 * steps).all())
+
+
+def test_harmonics_are_a_file_of_the_layer_that_has_some() -> None:
+    plain = page_scene("a", BOX.base(), BOX.base(), BOX.camera)
+    assert set(plain.files) == {"base.splats", "aux.splats"}
+    zeros = BOX.base().with_harmonics_count(8)  # as what was added to a scene that has harmonics
+    count = len(zeros)
+    shiny = dataclasses.replace(zeros, harmonics=random_harmonics(count, 2))
+    page = page_scene("a", shiny, zeros, BOX.camera)
+    assert {name: len(data) for name, data in page.files.items()} == {
+        "base.splats": 20 * count,
+        "base.harmonics": 27 * count,
+        "aux.splats": 20 * count,
+    }
+    assert page.files["base.splats"] == plain.files["base.splats"]
+    layers: Any = page.description["layers"]
+    base, aux = layers
+    assert base.pop("harmonics")["count"] == 8
+    assert [base, aux] == plain.description["layers"]
+    assert page_scene("a", zeros, zeros, BOX.camera) == plain
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ import pytest
 import torch
 from helpers import ROOT
 from helpers.photos import metres, write_depth, write_pair
-from helpers.scenes import box_before_wall, psnr
+from helpers.scenes import box_before_wall, psnr, random_harmonics
 from helpers.web_client import eventually, served
 from PIL import Image
 from torch import Tensor
@@ -259,6 +259,33 @@ def test_the_page_shows_what_our_renderer_shows(page: Any) -> None:
     divided = picture(page, 256, 192)  # the base before the divider
     torch.testing.assert_close(divided[:, :64], base[:, :64], rtol=0, atol=1.5 / 255)
     torch.testing.assert_close(divided[:, 64:], both[:, 64:], rtol=0, atol=1.5 / 255)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_colours_change_with_the_view_as_our_renderer_changes_them(
+    browser: Any, tmp_path: Path, degree: int
+) -> None:
+    harmonics = random_harmonics(len(box().base), degree).clamp(-0.6, 0.6)
+    # Constant parts beyond 0..1, which the harmonics bring back into it.
+    colors = box().base.colors * 1.3 - 0.05
+    shiny = dataclasses.replace(box(), base=dataclasses.replace(
+        box().base, colors=colors, harmonics=harmonics))  # fmt: skip
+    content = page_scene("Shiny", shiny.base, shiny.aux, shiny.camera, 0.35)
+    assert content.description["note"] == ""
+    (tmp_path / "shiny.html").write_bytes(single_html(content))
+    page = (found := opened(browser, (tmp_path / "shiny.html").as_uri())).page
+    settled(page, "spackle.ready")
+    pictures = []
+    for t in (0.0, 1.0):  # from the left, and from the right
+        page.evaluate("(t) => spackle.setView('swipe', 0.3, t)", t)
+        pictures.append(picture(page, 256, 192))
+        camera = camera_of(page, 256, 192)
+        assert psnr(pictures[-1], CPU.render(shiny.gaussians, camera).rgb) > 45
+        # By constant colours alone it would be another picture.
+        plain = CPU.render(shiny.gaussians.with_harmonics_count(0), camera).rgb
+        assert psnr(pictures[-1], plain) < 30
+    assert found.said == []
+    page.context.close()
 
 
 def test_hand_and_keys_move_the_eye_within_the_limit(page: Any) -> None:

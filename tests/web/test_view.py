@@ -20,7 +20,7 @@ from helpers.command import Run, refuses, report_of, run
 from helpers.foreign_scenes import khr_gltf, sog
 from helpers.photos import write_pair, write_photo
 from helpers.portraits import PORTRAIT
-from helpers.scenes import box_before_wall, random_gaussians
+from helpers.scenes import box_before_wall, random_gaussians, random_harmonics
 from helpers.systems import needs_posix_signals
 from helpers.web_client import PATIENCE_S, SCENES, Served, eventually
 
@@ -102,22 +102,24 @@ def test_a_scene_keeps_its_parts_and_its_camera(tmp_path: Path, visit: Callable[
 
 
 @pytest.mark.parametrize("given", ["folder", "meta.json", "scene.glb"])
-def test_a_scene_of_another_program_is_shown_with_what_it_lost(
+def test_a_scene_of_another_program_is_shown_with_its_harmonics(
     given: str, tmp_path: Path, visit: Callable[..., Run]
 ) -> None:
     folder = tmp_path / "garden"
     folder.mkdir()
     gaussians = random_gaussians(30)
-    for name, content in sog(gaussians, 2, bands=3).items():
+    shiny = dataclasses.replace(gaussians, harmonics=random_harmonics(30, 3))
+    for name, content in sog(shiny, 2).items():
         (folder / name).write_bytes(content)
     (folder / "scene.glb").write_bytes(khr_gltf(gaussians).glb())
     seen: list[Any] = []
     target = folder if given == "folder" else folder / given
     result = visit(lambda server, id: seen.append(page_of(server, id)), target)
     assert counts(seen[0]) == {"base": 30, "aux": 0}
-    lost = "" if given == "scene.glb" else "harmonics of degree 3 are dropped"
-    assert lost in seen[0]["note"]
-    assert lost in result.out + result.err
+    assert seen[0]["note"] == ""
+    assert "harmonics" not in result.out + result.err
+    shown = seen[0]["layers"][0].get("harmonics", {"count": 0})
+    assert shown["count"] == (0 if given == "scene.glb" else 15)
     assert seen[0]["name"] == ("scene" if given == "scene.glb" else "garden")
 
 

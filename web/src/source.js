@@ -30,7 +30,7 @@ export function file(id, name) {
 /** A scene of the server; `onProgress` hears of shares in 0..1. */
 export async function load(id, onProgress = () => {}) {
   const description = await (await answer(await fetch(file(id, "page.json")))).json();
-  const sizes = description.layers.map((layer) => 20 * layer.count);
+  const sizes = description.layers.map(({ count, harmonics }) => count * (20 + (harmonics ? 3 + 3 * harmonics.count : 0)));
   const all = Math.max(1, sizes.reduce((sum, size) => sum + size, 0));
   let read = 0;
   return withBytes(description, async (name) => {
@@ -95,8 +95,12 @@ export function here(path) {
 }
 
 async function withBytes(description, read) {
-  const layers = await Promise.all(description.layers.map(async (layer) => ({ ...layer, bytes: await read(layer.file) })));
-  return { description, layers };
+  const layers = description.layers.map(async (layer) => {
+    const whole = { ...layer, bytes: await read(layer.file) };
+    if (layer.harmonics) whole.harmonics = { ...layer.harmonics, bytes: await read(layer.harmonics.file) };
+    return whole;
+  });
+  return { description, layers: await Promise.all(layers) };
 }
 
 /** The response, or an error with the server's own line. */

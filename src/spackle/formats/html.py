@@ -1,5 +1,7 @@
 """A scene for the page: a description as JSON, and layers of 20 bytes for each Gaussian.
 
+Colours that change with the view, by spherical harmonics, are in a further file of a layer.
+
 `page_scene` prepares a scene; `single_html` puts it and the page into one file.
 """
 
@@ -20,9 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.color import linear_to_srgb
+from spackle.core.color import extended_linear_to_srgb, linear_to_srgb
 from spackle.core.gaussians import Gaussians
-from spackle.core.spherical_harmonics import degree_of_count
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     SHARP_TRAJECTORIES,
@@ -32,7 +33,6 @@ from spackle.core.trajectories import (
     trajectory_cameras,
 )
 from spackle.formats.quantization import encode_smallest_three, ordinary_length_factor
-from spackle.formats.scene_content import harmonics_loss
 from spackle.runtime.errors import InputError
 
 # The page interpolates linearly between this many positions along a path.
@@ -48,6 +48,9 @@ MAX_LIMIT = 1.0
 # Bytes of a Gaussian: 9 of the centre, 3 of the scales, 4 of the rotation, 3 of the colour, and
 # 1 of the opacity.
 BYTES_PER_GAUSSIAN = 20
+
+# The steps of a byte of the harmonics to either side of 0.
+HARMONICS_STEPS = 127
 
 # Scales beyond these bounds are clamped, because an outlier would cost the others precision.
 MIN_SCALE = 1e-7
@@ -96,8 +99,7 @@ def page_scene(
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal. The
             page's camera goes no farther. None if it is not known.
         note: a text for the user; empty for none. The page shows the whole text for some seconds,
-            and then only its beginning, up to the first semicolon. That colours do not change with
-            the view on the page is added where they do in the scene.
+            and then only its beginning, up to the first semicolon.
         is_metric: whether the scene's unit is known to be the metre.
 
     Raises:
@@ -106,10 +108,6 @@ def page_scene(
     if not bool((base.means[:, 2] > 0).any()):
         problem = "no Gaussian lies in front of the photo's camera"
         raise InputError(f"{name}: {problem}: nothing can be shown")
-
-    if base.harmonics is not None or aux.harmonics is not None:
-        degree = degree_of_count(max(base.harmonics_count, aux.harmonics_count))
-        note = "; ".join(filter(None, [note, harmonics_loss(degree)]))
 
     # The page computes in half and single floats, which suit metres: a scene in another unit is
     # shown in a similar one. Its paths are multiples of its own depths, and so stay the same.
@@ -154,22 +152,34 @@ def _encode_layers(
 
     Returns:
         The packed bytes of each layer by file name; and the description of each layer. A byte b of
-        a scale in the file stands for the logarithm scaleLow + b · scaleStep.
+        a scale in the file stands for the logarithm scaleLow + b · scaleStep. A layer whose colours
+        change with the view has the item harmonics: the name of a further file, the count of
+        harmonics, and the limit of `encode_harmonics`.
     """
     files = {}
     descriptions: list[dict[str, object]] = []
     for name, gaussians in layers.items():
         file_name = f"{name}.splats"
         files[file_name], scale_low, scale_step = encode_layer(gaussians)
-        descriptions.append(
-            {
-                "name": name,
-                "file": file_name,
-                "count": len(gaussians),
-                "scaleLow": scale_low,
-                "scaleStep": scale_step,
+        description: dict[str, object] = {
+            "name": name,
+            "file": file_name,
+            "count": len(gaussians),
+            "scaleLow": scale_low,
+            "scaleStep": scale_step,
+        }
+        # What completion adds has coefficients of 0, where it was joined to a scene that has
+        # others: they would only make the page larger.
+        harmonics = gaussians.harmonics
+        if harmonics is not None and bool(harmonics.any()):
+            harmonics_file = f"{name}.harmonics"
+            files[harmonics_file], limit = encode_harmonics(gaussians.colors, harmonics)
+            description["harmonics"] = {
+                "file": harmonics_file,
+                "count": harmonics.shape[1],
+                "limit": limit,
             }
-        )
+        descriptions.append(description)
     return files, descriptions
 
 
@@ -259,6 +269,37 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
         planes[16:19, block] = _byte_planes(linear_to_srgb(part.colors) * 255)
         planes[19, block] = _byte_planes(part.opacities[:, None] * 255)
     return planes.tobytes(), low, step
+
+
+@torch.no_grad()
+def encode_harmonics(colors: Tensor, harmonics: Tensor) -> tuple[bytes, float]:
+    """Pack the harmonics of N Gaussians for the page as byte planes.
+
+    A plane has one byte of each Gaussian. Each of the 1 + K vectors of three colours has three
+    planes: first what the constant colour exceeds 0..1 by in sRGB, which a layer has no room for;
+    then the coefficients, in their order. A byte 128 + s stands for ±(s / 127)² · limit with the
+    sign of s: most coefficients are small, and a single large one does not cost them precision.
+
+    Args:
+        colors: [N, 3] linear RGB of the constant part.
+        harmonics: [N, K, 3] coefficients of K harmonics.
+
+    Returns:
+        The bytes of the planes [3 · (1 + K), N]; and the limit, the largest amount of a value.
+    """
+    count = len(harmonics)
+    harmonics = harmonics.detach().to("cpu", torch.float32)
+    srgb = extended_linear_to_srgb(colors.detach().to("cpu", torch.float32))
+    excess = srgb - srgb.clamp(0, 1)
+    limit = max(float(excess.abs().max()), float(harmonics.abs().max()))
+
+    planes = np.empty((3 + 3 * harmonics.shape[1], count), np.uint8)
+    for start in range(0, count, GAUSSIANS_PER_BLOCK):
+        block = slice(start, start + GAUSSIANS_PER_BLOCK)
+        values = torch.cat([excess[block], harmonics[block].flatten(1)], dim=1)
+        steps = (values.abs() / limit).sqrt() * HARMONICS_STEPS
+        planes[:, block] = _byte_planes(steps * values.sign() + 128)
+    return planes.tobytes(), limit
 
 
 def _log_scale_steps(scales: Tensor) -> tuple[float, float]:

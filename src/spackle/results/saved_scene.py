@@ -51,7 +51,7 @@ def encode_page(file: SceneFile) -> bytes:
 
 
 # Formats in which a Gaussian has one colour.
-SUFFIXES_WITHOUT_HARMONICS = (".splat", ".html")
+SUFFIXES_WITHOUT_HARMONICS = (".splat",)
 PAGE_ENCODERS: dict[str, Encoder] = {".html": encode_page}
 
 

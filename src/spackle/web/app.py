@@ -33,7 +33,15 @@ from spackle.web.uploads import UPLOAD_FORM, accept_photo
 from spackle.web.work import PREVIEW, Download, FileName, SceneWork, Video
 
 SCENES_PATH = "/api/v1/scenes"
-PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # what the page draws
+# What the page draws.
+PagePart = Literal[
+    "page.json",
+    "base.splats",
+    "base.harmonics",
+    "aux.splats",
+    "aux.harmonics",
+    "photo.jpg",
+]
 # The files that a state lists if they exist.
 LISTED_FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video)])
 POLL_S = 0.1  # seconds between two checks whether a state has changed

@@ -20,8 +20,6 @@ from pathlib import Path
 from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.core.photo import check_photo_size, load_photo
-from spackle.core.spherical_harmonics import degree_of_count
-from spackle.formats.scene_content import harmonics_loss
 from spackle.formats.scene_files import is_scene_folder, load_scene, scene_suffix
 from spackle.results.saved_scene import log_losses, page_name
 from spackle.runtime.errors import InputError, as_input_error
@@ -143,9 +141,6 @@ def _check_target(target: Path, options: ViewOptions, reporter: Reporter) -> str
             scene = Scene.of_file(loaded, focal_px=options.focal_px, fov=options.fov)
             scene.page(target.name)  # fails if the page cannot show the scene
         log_losses(loaded, reporter)
-        degree = degree_of_count(loaded.gaussians.harmonics_count)
-        if degree > 0:  # the page has no room for them
-            reporter.log(f"{target.name}: {harmonics_loss(degree)}")
         return page_name(target)
 
     # A depth map belongs to the whole photo, so its frame must not be cropped.
