@@ -245,10 +245,13 @@ class Scene:
         scene = self if disparity is None else dataclasses.replace(self, disparity=disparity)
         write_atomic(target, scene.to_bytes("ply"))
 
-    def page(self, name: str, note: str = "") -> PageScene:
+    def page(
+        self, name: str, note: str = "", viewed_as: Mapping[str, object] | None = None
+    ) -> PageScene:
         """The scene in the form that the page of `spackle view` shows.
 
-        `name` is the title on the page, `note` a line for the user below it.
+        `name` is the title on the page, `note` a line for the user below it; `viewed_as` is the
+        description of a former state of the scene, whose lens and paths the page keeps.
         """
         return page_scene(
             name,
@@ -258,6 +261,7 @@ class Scene:
             self.disparity,
             note,
             is_metric=self.is_metric,
+            viewed_as=viewed_as,
         )
 
     def export(self, target: PathOrFile, format: str | None = None) -> None:

@@ -6,11 +6,9 @@ import base64
 import dataclasses
 import functools
 import hashlib
-import io
 import itertools
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,10 +17,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import ROOT
+from helpers.browser import Opened, opened, pixels, settled
 from helpers.photos import metres, write_depth, write_pair
 from helpers.scenes import box_before_wall, psnr, random_harmonics
 from helpers.web_client import eventually, served
-from PIL import Image
 from torch import Tensor
 
 from spackle.core.camera import Camera
@@ -42,12 +40,6 @@ from spackle.web.work import SceneWork
 
 WEB = ROOT / "web"
 CPU = CpuRenderer()
-FLAGS = (
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-)
 VIEW = ("swipe", 0.3, 1.0)  # far to the right, where there are holes
 
 
@@ -89,50 +81,6 @@ def test_the_built_page_belongs_to_its_sources() -> None:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    chromium = (
-        shutil.which("chromium")
-        or shutil.which("chromium-browser")
-        or shutil.which("google-chrome")
-    )
-    if chromium is None:
-        pytest.skip("there is no Chromium")
-    api = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is missing: pip install '.[dev]'"
-    )
-    with api.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=[*FLAGS])
-        yield browser
-        browser.close()
-
-
-@dataclasses.dataclass(frozen=True)
-class Opened:
-    """A page, with console messages and requested addresses."""
-
-    page: Any
-    said: list[str]
-    asked: list[str]
-
-
-def opened(browser: Any, url: str) -> Opened:
-    context = browser.new_context(viewport={"width": 740, "height": 490}, reduced_motion="reduce")
-    page = context.new_page()
-    page.set_default_timeout(300_000)  # ms; software draws slowly on a busy machine
-    found = Opened(page, [], [])
-    page.on("console", lambda message: found.said.append(message.text))
-    page.on("pageerror", lambda error: found.said.append(str(error)))
-    page.on("request", lambda request: found.asked.append(request.url))
-    page.goto(url)
-    return found
-
-
-def settled(page: Any, promise: str) -> None:
-    """Wait for a promise of the page, with a timeout (`evaluate` has none)."""
-    page.wait_for_function(f"{promise}.then(() => true)")
-
-
-@pytest.fixture(scope="module")
 def shown(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     """The single file, opened from the disk."""
     file = tmp_path_factory.mktemp("page") / "box.html"
@@ -151,11 +99,6 @@ def page(shown: Opened) -> Any:
     first += "spackle.setLayers('both'), spackle.setView(...view)"
     shown.page.evaluate(f"(view) => Promise.all([{first}])", list(VIEW))
     return shown.page
-
-
-def pixels(png: bytes) -> Tensor:
-    """[H, W, 3] in 0..1."""
-    return torch.from_numpy(np.array(Image.open(io.BytesIO(png)).convert("RGB"))).float() / 255
 
 
 def picture(page: Any, width: int, height: int) -> Tensor:

@@ -1,5 +1,6 @@
 // Starts the page: finds a scene, shows it, and takes further photos where there is a server.
 import { control } from "./controls.js";
+import { cameraAt, Edits } from "./edits.js";
 import { divider, fit, panel, roomy, unfold } from "./panel.js";
 import * as source from "./source.js";
 import { KINDS, Viewer } from "./viewer.js";
@@ -7,6 +8,7 @@ import { eyeOnPath, lookingAxes } from "./views.js";
 
 const STAGES = {
   load: "Loading", prepare: "Reading the depth map", base: "Finding depth", complete: "Filling what the photo hides",
+  "fill-seen": "Filling the holes that you have seen", remove: "Taking it out", patch: "Filling what it hid",
   write: "Almost there", measure: "Almost there", page: "Almost there",
 };
 const BASES = { auto: "the best that is here", sharp: "SHARP", moge: "MoGe-2", depth: "Depth Anything", lite: "lite: quick, and rough" };
@@ -14,12 +16,14 @@ const element = (id) => document.getElementById(id);
 const viewer = started();
 let upload = null; // what the server takes, where there is one
 let working = null; // the scene that is waited for
+let edits = null;
 
 if (viewer) {
   control(viewer.canvas, viewer);
   panel(viewer, say);
   divider(viewer);
   uploads();
+  edits = new Edits(viewer, { say, progress, begin: (id) => (working = id), end });
   const ready = first();
   ready.catch((error) => notice("Nothing to show", error.message));
   window.spackle = scripting(ready);
@@ -42,6 +46,7 @@ async function first() {
   if (own) return show(own);
   ({ upload } = await source.current());
   element("open").hidden = !upload;
+  edits.allowed = Boolean(upload);
   if (upload) element("file").accept = ["image/*", ...upload.suffixes].join(",");
   const bases = (upload?.bases ?? []).map((name) => new Option(BASES[name] ?? name, name));
   element("choices").querySelector("[name=base]").replaceChildren(...bases);
@@ -70,6 +75,7 @@ async function show({ description, layers }, id = null) {
   element("frame").classList.remove("waiting");
   element("notice").hidden = true;
   element("download").hidden = !id;
+  await edits.shown(id);
   if (description.note) say(description.note);
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
 }
@@ -78,7 +84,7 @@ async function show({ description, layers }, id = null) {
 async function watch(id) {
   working = id;
   viewer.playing = false; // the processor is needed elsewhere
-  history.replaceState(null, "", `#${id}`);
+  if (chosen() !== id) history.replaceState(null, "", `#${id}`); // else what can be done again stays
   progress(null, null);
   try {
     if (!stand.url && (await source.state(id)).files.includes("photo.jpg")) stand(source.file(id, "photo.jpg"));
@@ -89,6 +95,12 @@ async function watch(id) {
   }
   working = null;
   stand(null);
+}
+
+/** The work on a scene that is shown is over. */
+function end() {
+  working = null;
+  element("notice").hidden = true;
 }
 
 /** Show a picture until the scene is there. */
@@ -236,6 +248,12 @@ function scripting(ready) {
     get description() {
       return viewer.description;
     },
+    get id() {
+      return viewer.id;
+    },
+    /** The present view as the server takes it, for what is filled. */
+    camera: () => cameraAt(viewer.description, viewer.stage.eye, viewer.stage.zoom),
+    seen: () => edits.seen.withPresent(),
     /** Eye [x, y, z] in metres at t in 0..1 of a path. */
     eye: (kind, disparity, t) => eyeOnPath(viewer.description, kind, disparity, t),
     /** Where the eye is, and the rows right, down, forward of the camera's rotation. */

@@ -29,7 +29,8 @@ export function panel(viewer, say) {
   element("full").onclick = () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
   document.addEventListener("fullscreenchange", () => press("full", Boolean(document.fullscreenElement)));
   element("download").onchange = ({ target }) => {
-    made(`scene${target.value}`, `Making the ${target.value} file…`);
+    const { value } = target;
+    made(value.startsWith(".") ? `scene${value}` : value, `Making the ${value} file…`);
     target.value = "";
   };
   element("shot").onclick = () => savePicture(viewer).catch((error) => say(`The picture was not saved: ${error.message}`));

@@ -11,7 +11,8 @@ export async function savePicture(viewer) {
 
 /** A file that the server makes of the scene, for as long as that takes. */
 export async function saveFile(viewer, name) {
-  download(await fetched(viewer.id, name), fileName(viewer) + /\.[^.]*$/.exec(name)[0]);
+  const kind = name === "removed.ply" ? "-without-patch" : "";
+  download(await fetched(viewer.id, name), fileName(viewer) + kind + /\.[^.]*$/.exec(name)[0]);
 }
 
 function sharpest({ canvas, description }) {

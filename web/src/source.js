@@ -63,6 +63,23 @@ export async function send(photo, { base = "", disparity = "", depth = null, dep
   return (await (await answer(await fetch(here(SCENES), { method: "POST", body: form }))).json()).id;
 }
 
+/** Have the server fill a scene where cameras see holes; the id of the scene that it makes. */
+export function fill(id, cameras) {
+  return edit(`${id}/fill`, { cameras });
+}
+
+/** Have the server take out what a mask marks in a camera's view, and fill what it hid; the id of the scene that it makes. */
+export function cut(id, camera, mask) {
+  return edit(`${id}/remove`, { camera }, mask);
+}
+
+async function edit(path, options, mask = null) {
+  const form = new FormData();
+  form.set("options", JSON.stringify(options));
+  if (mask) form.set("mask", mask, "mask.png");
+  return (await (await answer(await fetch(here(`${SCENES}/${path}`), { method: "POST", body: form }))).json()).id;
+}
+
 /** Have the server forget a scene, and end the work on it. */
 export async function remove(id) {
   await answer(await fetch(here(`${SCENES}/${id}`), { method: "DELETE" }));

@@ -59,6 +59,7 @@ export class Stage {
     this.layers = "both";
     this.heat = false;
     this.split = null;
+    this.spare = null; // where is drawn while the canvas keeps its picture
   }
 
   makeSpark(onDirty) {
@@ -99,6 +100,16 @@ export class Stage {
     const sheet = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), material);
     sheet.frustumCulled = false;
     return sheet;
+  }
+
+  /** Take a scene in place of the one before, whose picture stays until this one is settled. */
+  async replace(description, layers) {
+    this.spare = new THREE.WebGLRenderTarget(1, 1, { depthBuffer: false });
+    this.show(description, layers);
+    await this.settled();
+    this.spare.dispose();
+    this.spare = null;
+    this.draw();
   }
 
   /** Take a scene in place of the one before; `layers` are the description's, with their `bytes`. */
@@ -155,7 +166,7 @@ export class Stage {
   draw() {
     if (!this.mesh) return;
     const size = this.renderer.getDrawingBufferSize(new THREE.Vector2());
-    this.drawTo(null, size.x, size.y);
+    this.drawTo(this.spare, size.x, size.y);
   }
 
   drawTo(target, width, height) {

@@ -40,6 +40,14 @@ export class Viewer extends EventTarget {
     this.changed();
   }
 
+  /** Another state of the same scene; everything else stays as it is. */
+  async replace(description, layers, id) {
+    this.id = id;
+    const settled = this.stage.replace(description, layers);
+    this.changed();
+    await settled;
+  }
+
   changed() {
     this.refresh();
     this.dispatchEvent(new Event("change"));

@@ -45,8 +45,8 @@ SidePx = Annotated[int, Strict(), Field(ge=1, le=MAX_SIDE_PX)]
 Model = TypeVar("Model", bound=BaseModel)
 
 
-class _CameraEntry(BaseModel):
-    """One camera in a file."""
+class CameraEntry(BaseModel):
+    """One camera in a file, or of a client of the server."""
 
     K: tuple[Row3, Row3, Row3]
     world_to_camera: tuple[Row4, Row4, Row4, Row4]
@@ -57,7 +57,7 @@ class _CameraEntry(BaseModel):
 class _CameraFile(BaseModel):
     """A file of cameras; its width and height hold for cameras that have none."""
 
-    frames: Annotated[list[_CameraEntry], Field(min_length=1, max_length=MAX_FRAMES)]
+    frames: Annotated[list[CameraEntry], Field(min_length=1, max_length=MAX_FRAMES)]
     width: SidePx | None = None
     height: SidePx | None = None
 
@@ -111,12 +111,12 @@ def camera_from_json(camera_entry: Mapping[str, Any], where: str) -> Camera:
         InputError: the entry is incomplete, or the camera is impossible.
     """
     with as_input_error(where, "{reason}", ValidationError):
-        entry = _CameraEntry.model_validate(camera_entry)
+        entry = CameraEntry.model_validate(camera_entry)
     return _camera_from_entry(entry, entry.width, entry.height, where)
 
 
 def _camera_from_entry(
-    entry: _CameraEntry, width: int | None, height: int | None, where: str
+    entry: CameraEntry, width: int | None, height: int | None, where: str
 ) -> Camera:
     """Return a camera from a file's entry; InputError if it is impossible or has no size."""
     K = torch.tensor(entry.K, dtype=torch.float64)

@@ -15,6 +15,7 @@ import json
 import math
 from collections.abc import Mapping
 from importlib import resources
+from typing import Any
 
 import numpy as np
 import torch
@@ -61,6 +62,9 @@ MIN_LOG_SCALE_RANGE = 1e-3
 # So many Gaussians are packed at a time that their values fit the processor's cache.
 GAUSSIANS_PER_BLOCK = 1 << 16
 
+# The items of a description that say how the page's camera looks and moves.
+VIEWING_ITEMS = ("camera", "focus", "zNear", "orbit", "paths")
+
 # The places in the page where the style and the script are put.
 STYLE_TAG = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT_TAG = '<script src="viewer.js" defer></script>'
@@ -83,6 +87,7 @@ def page_scene(
     note: str = "",
     *,
     is_metric: bool = False,
+    viewed_as: Mapping[str, Any] | None = None,
 ) -> PageScene:
     """Prepare a scene for the page.
 
@@ -101,6 +106,8 @@ def page_scene(
         note: a text for the user; empty for none. The page shows the whole text for some seconds,
             and then only its beginning, up to the first semicolon.
         is_metric: whether the scene's unit is known to be the metre.
+        viewed_as: the description of a former state of the scene, whose lens, paths and unit of
+            length the page keeps: nothing but the Gaussians changes for its user.
 
     Raises:
         InputError: no Gaussian lies in front of the camera.
@@ -111,7 +118,10 @@ def page_scene(
 
     # The page computes in half and single floats, which suit metres: a scene in another unit is
     # shown in a similar one. Its paths are multiples of its own depths, and so stay the same.
-    length_factor = ordinary_length_factor(base.means.detach().cpu().numpy())
+    if viewed_as is None:
+        length_factor = ordinary_length_factor(base.means.detach().cpu().numpy())
+    else:
+        length_factor = float(viewed_as.get("lengthFactor", 1))
     depths = DepthRange.of(base, is_metric=is_metric)
     depths = DepthRange(near=depths.near * length_factor, focus=depths.focus * length_factor)
     if length_factor != 1:
@@ -142,6 +152,10 @@ def page_scene(
         "paths": {kind: _path_positions(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
     }
+    if length_factor != 1:  # the server's scene has the unit of its file
+        description["lengthFactor"] = length_factor
+    if viewed_as is not None:
+        description |= {item: viewed_as[item] for item in VIEWING_ITEMS}
     return PageScene(description, files)
 
 

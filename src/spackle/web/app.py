@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, get_args
@@ -29,7 +30,14 @@ from spackle.formats.html import read_page_file
 from spackle.runtime.task_process import TaskFunction
 from spackle.web.guard import MAX_UPLOAD_BYTES, Access, Guard
 from spackle.web.jobs import Job, Jobs, RetentionLimits, SceneState
-from spackle.web.uploads import UPLOAD_FORM, accept_photo
+from spackle.web.uploads import (
+    FILL_FORM,
+    REMOVAL_FORM,
+    UPLOAD_FORM,
+    accept_fill,
+    accept_photo,
+    accept_removal,
+)
 from spackle.web.work import PREVIEW, Download, FileName, SceneWork, Video
 
 SCENES_PATH = "/api/v1/scenes"
@@ -111,6 +119,14 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
     app.add_api_route(
         SCENES_PATH, handlers.post_photo, methods=["POST"], status_code=202, openapi_extra=form
     )
+    for path, handler, fields in (
+        ("/fill", handlers.post_fill, FILL_FORM),
+        ("/remove", handlers.post_removal, REMOVAL_FORM),
+    ):
+        form = {"requestBody": {"content": {"multipart/form-data": fields}}}
+        app.add_api_route(
+            one_scene + path, handler, methods=["POST"], status_code=202, openapi_extra=form
+        )
     app.add_api_route(one_scene, handlers.get_state, methods=["GET"])
     app.add_api_route(one_scene, handlers.delete, methods=["DELETE"], status_code=204)
     app.add_api_route(
@@ -171,19 +187,46 @@ class SceneHandlers:
 
     async def post_photo(self, request: Request, response: Response) -> SceneState:
         """Send a photo. The photo is queued; if the queue is full, the answer is 429."""
+        bases = self.list_bases()
+        accept = functools.partial(accept_photo, bases=bases)
+        return await self._accept(request, response, accept)
+
+    async def post_fill(self, id: str, request: Request, response: Response) -> SceneState:
+        """Fill a finished scene where views show holes; the result is another scene.
+
+        Its file report.json says how many Gaussians were added.
+        """
+        accept = functools.partial(accept_fill, parent=self.find_finished(id))
+        return await self._accept(request, response, accept)
+
+    async def post_removal(self, id: str, request: Request, response: Response) -> SceneState:
+        """Take the thing that a mask marks out of a finished scene, and fill what it hid.
+
+        The result is another scene. Its file removed.ply is the scene without the thing, before
+        anything was filled; report.json says how many Gaussians were removed and added.
+        """
+        accept = functools.partial(accept_removal, parent=self.find_finished(id))
+        return await self._accept(request, response, accept)
+
+    async def _accept(
+        self, request: Request, response: Response, accept: Callable[..., Job]
+    ) -> SceneState:
+        """Receive a form, have `accept` check and queue it, and answer with the job's state.
+
+        `accept` takes the form, a folder for its files, and `jobs`. HTTPException 429 if the queue
+        is full, 408 for a form that comes too slowly.
+        """
         # The place is reserved first, so that a refused photo is not even received.
         with self.jobs.reserve_place() as upload_folder:
             try:
-                # Two files: the photo and its depth map. One text field: the options.
+                # Two files, such as the photo and its depth map. One text field: the options.
                 reading = request.form(max_files=2, max_fields=1)
                 form = await asyncio.wait_for(reading, MAX_UPLOAD_S)
             except asyncio.TimeoutError:
                 raise HTTPException(408, "the photo arrived too slowly") from None
             try:
                 async with self.decoding:
-                    job = await run_in_threadpool(
-                        accept_photo, form, upload_folder, self.jobs, self.list_bases()
-                    )
+                    job = await run_in_threadpool(accept, form, upload_folder, self.jobs)
             finally:
                 await form.close()
 
@@ -227,7 +270,7 @@ class SceneHandlers:
                 raise HTTPException(409, job.error or "this scene is not done yet")
             # What the page draws was written with the scene, so it cannot be made now.
             if file in get_args(PagePart):
-                raise HTTPException(404, "this file exists only for photos, and a scene was opened")
+                raise HTTPException(404, "this scene has no such file")
             # If this client disconnects, the file is still made, because others may want it, too.
             future_error = asyncio.wrap_future(self.jobs.make_file(job, file))
             error = await asyncio.shield(future_error)
@@ -253,6 +296,13 @@ class SceneHandlers:
     async def get_health(self) -> dict[str, str]:
         """An answer that says that the server runs, for those who watch over it."""
         return {"status": "ok"}
+
+    def find_finished(self, id: str) -> Job:
+        """The job with an id; HTTPException 404 if there is none, 409 if it has no scene yet."""
+        job = self.find_job(id)
+        if job.state != "done":
+            raise HTTPException(409, job.error or "this scene is not done yet")
+        return job
 
     def find_job(self, id: str) -> Job:
         """The job with an id; HTTPException 404 if there is none."""

@@ -37,6 +37,18 @@ class RetentionLimits(NamedTuple):
     waiting: int = 32  # jobs in the queue
 
 
+EditKind = Literal["fill", "remove"]
+
+
+class Edit(NamedTuple):
+    """What is to be done to a scene, which becomes another scene."""
+
+    kind: EditKind
+    parent: str  # the id of the scene
+    cameras: list[dict[str, Any]]  # the views to fill, or the one in which a mask was drawn
+    mask: str | None = None  # the mask's file, a name in the job's folder
+
+
 class SceneState(BaseModel):
     """The state of a photo, as clients see it."""
 
@@ -54,6 +66,10 @@ class SceneState(BaseModel):
     )
     created: float = Field(default_factory=time.time, description="Seconds since 1970.")
     ended: float | None = None
+    parent: str | None = Field(
+        default=None, description="The scene from which this one was made by an edit."
+    )
+    edit: EditKind | None = Field(default=None, description="What was done to the parent.")
 
 
 class Job(SceneState):
@@ -65,6 +81,9 @@ class Job(SceneState):
     source: str  # the photo: a name in the job's folder, or an absolute path
     depth: str | None = None  # its depth map, in the same way
     options: dict[str, Any] = {}  # what the client has set
+    # Of an edit: the views to fill, or the view in which the mask was drawn, as JSON; the mask.
+    cameras: list[dict[str, Any]] = []
+    mask: str | None = None
     folder: Path = Field(default=Path(), exclude=True)
 
     @property
@@ -168,9 +187,15 @@ class Jobs:
             shutil.rmtree(folder, ignore_errors=True)
 
     def add(
-        self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]
+        self,
+        folder: Path,
+        name: str,
+        source: str,
+        depth: str | None,
+        options: dict[str, Any],
+        edit: Edit | None = None,
     ) -> Job:
-        """Add a job for a photo, and queue it; returns the job.
+        """Add a job for a photo or for an edit of a scene, and queue it; returns the job.
 
         Args:
             folder: a folder that `reserve_place` has yielded; it becomes the folder of the job.
@@ -178,9 +203,14 @@ class Jobs:
             source: the photo's file, a name in the folder or an absolute path.
             depth: its depth map, in the same way; None if there is none.
             options: what the client has set.
+            edit: what is to be done to the scene in the file `source`; None for a photo.
         """
         id = folder.name.removeprefix(UPLOAD_PREFIX)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
+        if edit is not None:
+            changes = {"edit": edit.kind, **edit._asdict()}
+            del changes["kind"]
+            job = job.model_copy(update=changes)
         job.save()
         # `reserve_place` counts folders and jobs, so the two change together.
         with self._lock:
@@ -311,7 +341,7 @@ class Jobs:
             # If the disk is full, the next server repeats the job, and needs the photo.
             with contextlib.suppress(InputError):
                 ended_job.save()
-                for file in (job.source, job.depth):
+                for file in (job.source, job.depth, job.mask):
                     # An absolute path is a file of the user, which is not ours to delete.
                     if file is not None and not os.path.isabs(file):
                         (job.folder / file).unlink(missing_ok=True)

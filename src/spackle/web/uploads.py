@@ -1,13 +1,14 @@
-"""What a client sends: a form with a photo, its depth map and options, which is checked here."""
+"""What a client sends, which is checked here: a photo with its depth map, or an edit of a scene."""
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 
@@ -20,17 +21,50 @@ from spackle.core.image_formats import (
     not_a_photo,
 )
 from spackle.depth.readers import DEPTH_SUFFIXES
+from spackle.formats.camera_files import CameraEntry, camera_from_json
 from spackle.runtime.errors import InputError, first_validation_problem, printable_line
-from spackle.web.jobs import Job, Jobs
-from spackle.web.work import PREVIEW, SceneOptions, check_photo
+from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, read_mask
+from spackle.web.jobs import Edit, Job, Jobs
+from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions, check_photo
 
 MAX_NAME_CHARACTERS = 80
+MAX_VIEWS = 32  # of a fill
+MAX_VIEW_PIXELS = 4_000_000  # of a view, as for photos of Spackle's working size
+MODEL = TypeVar("MODEL", bound=BaseModel)
 DEPTH_NAME = "depth map"  # what messages call an uploaded depth map
 PHOTO_DESCRIPTION = (
     "A photo; its content decides, not its name. The usual names end in "
     f"{', '.join(PHOTO_SUFFIXES)}."
 )
 BINARY_FILE = {"type": "string", "format": "binary"}
+
+
+def _edit_form(options: type[BaseModel], **files: dict[str, str]) -> dict[str, Any]:
+    """The form of an edit in the description of the HTTP interface.
+
+    Args:
+        options: the model of its field `options`, which is JSON.
+        **files: the descriptions of its files, by their names.
+    """
+    schema = options.model_json_schema()
+    # References lead to the whole description, so the camera's schema is put in their place.
+    camera = schema.pop("$defs")["CameraEntry"]
+    for field in schema["properties"].values():
+        if "$ref" in field:
+            del field["$ref"]
+            field.update({**camera, "description": field["description"]})
+        else:
+            field["items"] = camera
+    return {
+        "schema": {
+            "type": "object",
+            "required": [*files, "options"],
+            "properties": {**files, "options": schema},
+        },
+        "encoding": {"options": {"contentType": "application/json"}},
+    }
+
+
 # The form in the description of the HTTP interface. It is not declared as a parameter, because
 # FastAPI would then read it before the queue has a place.
 UPLOAD_FORM: dict[str, Any] = {
@@ -48,6 +82,38 @@ UPLOAD_FORM: dict[str, Any] = {
     },
     "encoding": {"options": {"contentType": "application/json"}},
 }
+
+
+class FillRequest(BaseModel):
+    """Options of a fill."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    cameras: list[CameraEntry] = Field(
+        min_length=1,
+        max_length=MAX_VIEWS,
+        description="The views to fill, in the scene's world: each has K in pixels, "
+        "world_to_camera (OpenCV: x right, y down, z forward), width and height.",
+    )
+
+
+class RemovalRequest(BaseModel):
+    """Options of a removal."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    camera: CameraEntry = Field(
+        description="The view in which the mask was drawn, in the scene's world: K in pixels, "
+        "world_to_camera (OpenCV: x right, y down, z forward), width and height."
+    )
+
+
+FILL_FORM = _edit_form(FillRequest)
+MASK_FIELD = {
+    **BINARY_FILE,
+    "description": "A picture of the camera's size: white, or opaque, where the thing is.",
+}
+REMOVAL_FORM = _edit_form(RemovalRequest, mask=MASK_FIELD)
 
 
 def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[str]) -> Job:
@@ -96,6 +162,97 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
         depth=depth_file,
         options=given_options,
     )
+
+
+def accept_fill(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: Job) -> Job:
+    """Check a form that asks for a fill of a finished scene, and queue it; returns its job.
+
+    HTTPException 422 for a form without cameras, or with impossible ones.
+    """
+    request = _edit_options(form, FillRequest)
+    cameras = [camera.model_dump() for camera in request.cameras]
+    for index, camera in enumerate(cameras):
+        _check_view(camera, f"cameras.{index}")
+    return _add_edit(Edit("fill", parent.id, cameras), upload_folder, jobs, parent)
+
+
+def accept_removal(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: Job) -> Job:
+    """Check a form with the mask of a thing in a finished scene, and queue it; returns its job.
+
+    HTTPException 422 for a form without mask or camera, or with an impossible camera; 415 for a
+    mask that is no picture of the camera's size.
+    """
+    request = _edit_options(form, RemovalRequest)
+    camera = request.camera.model_dump()
+    _check_view(camera, "camera")
+    mask = form.get("mask")
+    if not isinstance(mask, UploadFile):
+        raise HTTPException(422, "send the mask as the file `mask`")
+    store_upload(mask, upload_folder, MASK_FILE)
+    try:
+        read_mask(upload_folder / MASK_FILE, camera["width"], camera["height"])
+    except InputError as error:
+        raise HTTPException(415, str(error)) from error
+    return _add_edit(Edit("remove", parent.id, [camera], MASK_FILE), upload_folder, jobs, parent)
+
+
+def _edit_options(form: FormData, model: type[MODEL]) -> MODEL:
+    """The field `options` of a form, checked; HTTPException 422 if it is missing or bad."""
+    text = form.get("options")
+    if not isinstance(text, str):
+        raise HTTPException(422, "send the options as the text `options`")
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        problem = printable_line(f"options: {first_validation_problem(error)}")
+        raise HTTPException(422, problem) from error
+
+
+def _check_view(camera: dict[str, Any], where: str) -> None:
+    """HTTPException 422 for a camera that is impossible or has too many pixels."""
+    try:
+        view = camera_from_json(camera, f"options: {where}")
+    except InputError as error:
+        raise HTTPException(422, printable_line(str(error))) from error
+    if view.width * view.height > MAX_VIEW_PIXELS:
+        problem = f"{view.width}×{view.height} are too many pixels"
+        limit = f"{MAX_VIEW_PIXELS / 1e6:g} million"
+        raise HTTPException(422, f"options: {where}: {problem}: at most {limit}")
+
+
+def _add_edit(edit: Edit, upload_folder: Path, jobs: Jobs, parent: Job) -> Job:
+    """Queue an edit of a scene, with files of its own; returns its job.
+
+    HTTPException 409 if the scene has been deleted meanwhile.
+    """
+    try:
+        # The edit must not depend on how long its parent is kept.
+        _link_or_copy(parent.results / SCENE_FILE, upload_folder / EDIT_SOURCE)
+        _link_or_copy(parent.results / PAGE, upload_folder / FORMER_PAGE)
+    except FileNotFoundError:
+        raise HTTPException(409, "this scene has been deleted") from None
+    return jobs.add(
+        upload_folder,
+        name=parent.name,
+        source=EDIT_SOURCE,
+        depth=None,
+        # Those of the videos go on; files are made when they are asked for.
+        options={**parent.options, "files": []},
+        edit=edit,
+    )
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    """Another name for a file, or a copy where the disk has no such names.
+
+    Nobody changes a file of results: a new one is written and takes its name.
+    """
+    try:
+        os.link(source, target)
+    except FileNotFoundError:
+        raise
+    except OSError:
+        shutil.copyfile(source, target)
 
 
 def read_options(text: str, bases: list[str]) -> SceneOptions:

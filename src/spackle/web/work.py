@@ -22,21 +22,37 @@ from spackle.core.photo import check_photo_size, refuse_if_not_flat
 from spackle.core.srgb_pictures import picture_to_srgb
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import DepthKind
-from spackle.formats.html import html_safe_json, single_html
+from spackle.formats.camera_files import camera_from_json
+from spackle.formats.html import PageScene, html_safe_json, single_html
 from spackle.formats.scene_files import load_scene, scene_suffix
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import get_renderer
 from spackle.results.photo_folder import REPORT_NAME, PhotoOptions, predict_photo
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import write_atomic
+from spackle.runtime.files import write_atomic, write_json
 from spackle.runtime.progress import Progress, Reporter
 from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
 from spackle.video.video_formats import DEFAULT_FPS
 from spackle.views import DEFAULT_VIDEO_SECONDS, MAX_FRAME_COUNT, PathOptions
+from spackle.web.edits import (
+    FORMER_PAGE,
+    REMOVED_FILE,
+    fill_views,
+    read_mask,
+    remove_and_patch,
+)
 from spackle.web.jobs import Job
 
-Download = Literal["scene.ply", "scene.spz", "scene.sog", "scene.glb", "scene.html", "report.json"]
+Download = Literal[
+    "scene.ply",
+    "scene.spz",
+    "scene.sog",
+    "scene.glb",
+    "scene.html",
+    "removed.ply",
+    "report.json",
+]
 Video = Literal[
     "video.mp4",
     "swipe.mp4",
@@ -137,9 +153,12 @@ class SceneWork:
         options = SceneOptions.model_validate({**self.default_options, **job.options})
         reporter = JobReporter(job, send_event, self.verbose)
         try:
-            if file is None:
-                scene = self._make_scene(job, options, reporter)
+            if file is None and job.edit is not None:
+                scene = self._edit_scene(job, reporter)
                 files: Sequence[str] = options.files
+            elif file is None:
+                scene = self._make_scene(job, options, reporter)
+                files = options.files
             else:
                 scene = Scene.load(job.results / SCENE_FILE)
                 files = [file]
@@ -169,11 +188,37 @@ class SceneWork:
         # Read again, so that the page shows exactly what is in the file.
         scene = Scene.load(scene_file)
         with reporter.stage("page"):
-            page = scene.page(job.name, note)
-            for name, content in page.files.items():
-                write_atomic(job.results / name, content)
-            write_atomic(job.results / PAGE, html_safe_json(page.description))
+            self._write_page(job, scene.page(job.name, note))
         return scene
+
+    def _edit_scene(self, job: Job, reporter: JobReporter) -> Scene:
+        """Make the scene of a job that edits another one, and write what the page draws.
+
+        InputError if a mask marks nothing, or everything.
+        """
+        cameras = [camera_from_json(entry, "camera") for entry in job.cameras]
+        scene_file = job.results / SCENE_FILE
+        renderer = get_renderer(self.base.device)
+        if job.mask is None:
+            report = fill_views(job.folder / job.source, scene_file, cameras, renderer, reporter)
+        else:
+            mask = read_mask(job.folder / job.mask, cameras[0].width, cameras[0].height)
+            report = remove_and_patch(
+                job.folder / job.source, scene_file, (cameras[0], mask), renderer, reporter
+            )
+        write_json(report, job.results / REPORT_NAME)
+
+        scene = Scene.load(scene_file)
+        with reporter.stage("page"):
+            former = json.loads((job.folder / FORMER_PAGE).read_bytes())
+            self._write_page(job, scene.page(job.name, former["note"], viewed_as=former))
+        return scene
+
+    def _write_page(self, job: Job, page: PageScene) -> None:
+        """Write what the page draws into a job's results; the description last."""
+        for name, content in page.files.items():
+            write_atomic(job.results / name, content)
+        write_atomic(job.results / PAGE, html_safe_json(page.description))
 
     def _complete_photo(self, job: Job, options: SceneOptions, reporter: JobReporter) -> str:
         """Complete a photo: write the scene and its report, and perhaps a video, into the results.
@@ -232,6 +277,8 @@ class SceneWork:
         # A photo's report was written with its scene. If it has to be made, there was no photo.
         if target.name == REPORT_NAME:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
+        if target.name == REMOVED_FILE:
+            raise InputError(f"{job.name}: nothing was removed from this scene")
         if target.suffix == ".mp4":
             # swipe.mp4, for example, shows the camera path "swipe"; video.mp4 shows the path of the
             # job's options. The loop tells the type checker that the name is one of the paths.
@@ -243,7 +290,7 @@ class SceneWork:
             scene.save_video(target, trajectory, frames=options.frames, renderer=renderer)
         elif target.suffix == ".html":
             description = json.loads((job.results / PAGE).read_bytes())
-            page = scene.page(job.name, description["note"])
+            page = scene.page(job.name, description["note"], viewed_as=description)
             write_atomic(target, single_html(page))
         else:
             scene.export(target)

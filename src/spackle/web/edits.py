@@ -1,0 +1,198 @@
+"""Edits of a finished scene in a worker process: fill what views show open, or remove a thing.
+
+The Gaussians of the scene that stay keep their numbers, and those that an edit adds come last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from spackle.bases import DEFAULT_MAX_DISPARITY
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.image_files import OpenPicture, read_picture
+from spackle.core.trajectories import DepthRange, trajectory_cameras
+from spackle.formats.ply import encode_ply
+from spackle.formats.ply_append import append_to_ply
+from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_files import load_scene
+from spackle.pipeline import fill
+from spackle.render import Renderer
+from spackle.residual import hole_area_ratio
+from spackle.residual.features import hole_mask
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import write_atomic
+from spackle.runtime.progress import Reporter
+from spackle.scene import Scene
+from spackle.scene_fill.removal import marked_gaussians
+
+# Files of a job that edits a scene: the scene before, what the page shows of it, and the mask.
+EDIT_SOURCE = "source.ply"
+FORMER_PAGE = "former.json"
+MASK_FILE = "mask.png"
+REMOVED_FILE = "removed.ply"  # among the results: the scene without a thing, before the patch
+
+WHITE_THRESHOLD = 128  # of 0..255, from which on a pixel of a mask is white
+# After a removal, so many views around the scene's camera are filled besides the present one.
+VIEWS_AROUND = 8
+# Long side of these views; finer ones would take longer, and the present one is as it is.
+AROUND_SIDE_PX = 1024
+
+
+def fill_views(
+    source: Path, target: Path, cameras: Sequence[Camera], renderer: Renderer, reporter: Reporter
+) -> dict[str, Any]:
+    """Fill a scene where cameras see holes, and write it; returns the report.
+
+    Args:
+        source: the scene, a PLY of Spackle.
+        target: the file to write: the rows of `source`, byte for byte, and then the new ones.
+        cameras: the views, in the scene's world; the last one is the view on the screen.
+        renderer: renders the scene.
+        reporter: gets progress and a line about the result.
+    """
+    loaded = load_scene(source)
+    with reporter.stage("fill-seen") as progress:
+        filled = fill(loaded.gaussians, cameras, renderer=renderer, progress=progress)
+    added = filled.select(slice(len(loaded.gaussians), None))
+    write_atomic(target, _with_more(source, added))
+
+    before = _hole_ratio(loaded.gaussians, cameras[-1], renderer)
+    after = _hole_ratio(filled, cameras[-1], renderer)
+    reporter.log(
+        f"{loaded.path.name}: {len(added):,} Gaussians added in {len(cameras)} views, "
+        f"holes of the present one {before:.1%} -> {after:.2%}"
+    )
+    return {"edit": "fill", "added": len(added), "removed": 0, "before": before, "after": after}
+
+
+def remove_and_patch(
+    source: Path,
+    target: Path,
+    mark: tuple[Camera, Tensor],
+    renderer: Renderer,
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Take a marked thing out of a scene, fill what it hid, and write both; returns the report.
+
+    Args:
+        source: the scene, a PLY of Spackle.
+        target: the file of the patched scene; `REMOVED_FILE` beside it is the scene without the
+            thing, whose Gaussians are the first ones of `target`.
+        mark: a camera in the scene's world, and its mask [H, W] bool, true on the thing.
+        renderer: renders the scene.
+        reporter: gets progress and a line about the result.
+
+    Raises:
+        InputError: the mask marks nothing, or the whole scene.
+    """
+    camera, mask = mark
+    loaded = load_scene(source)
+    with reporter.stage("remove"):
+        marked = marked_gaussians(loaded.gaussians, [(camera, mask)], renderer)
+    removed_count = int(marked.sum())
+    if removed_count == 0:
+        raise InputError("nothing stands there: paint over the whole thing that is to go")
+    if removed_count == len(marked):
+        raise InputError("nothing would be left: paint over the thing alone")
+    rest = _without(loaded, marked)
+    removed_file = target.with_name(REMOVED_FILE)
+    write_atomic(removed_file, encode_ply(rest))
+
+    # Only what the thing covered is filled: a sky, or what was open before, stays as it was.
+    cameras = [camera, *_views_around(loaded)]
+    with torch.no_grad():
+        alphas = [renderer.render(loaded.gaussians, view).alpha for view in cameras]
+    fillable = [~hole_mask(alpha).cpu() for alpha in alphas]
+    before = _hole_ratio(rest.gaussians, camera, renderer)
+    with reporter.stage("patch") as progress:
+        patched = fill(
+            rest.gaussians, cameras, renderer=renderer, progress=progress, fillable=fillable
+        )
+    added = patched.select(slice(len(rest.gaussians), None))
+    write_atomic(target, _with_more(removed_file, added))
+
+    after = _hole_ratio(patched, camera, renderer)
+    reporter.log(
+        f"{loaded.path.name}: {removed_count:,} Gaussians removed, {len(added):,} added, "
+        f"holes of the present view {before:.1%} -> {after:.2%}"
+    )
+    return {
+        "edit": "remove",
+        "added": len(added),
+        "removed": removed_count,
+        "before": before,
+        "after": after,
+    }
+
+
+def read_mask(path: Path, width: int, height: int) -> Tensor:
+    """The mask in a picture's file, [H, W] bool: true where it is white, and not transparent.
+
+    InputError if the file is no picture, or has not `width` × `height` pixels.
+    """
+
+    def read(picture: OpenPicture) -> Tensor:
+        """The mask of an open picture."""
+        image = picture.image
+        if image.size != (width, height):
+            size = f"{image.width}×{image.height}"
+            raise InputError(f"mask: {size} pixels, but its camera has {width}×{height}")
+        bands = image.convert("LA")
+        white = torch.frombuffer(bytearray(bands.tobytes()), dtype=torch.uint8)
+        light, opaque = white.view(height, width, 2).unbind(-1)
+        return (light >= WHITE_THRESHOLD) & (opaque >= WHITE_THRESHOLD)
+
+    try:
+        mask = read_picture(path, read)
+    except InputError as error:
+        raise InputError(str(error).replace(str(path), "mask")) from error
+    if not bool(mask.any()):
+        raise InputError("mask: it marks no pixel: paint the thing white")
+    return mask
+
+
+def _with_more(source: Path, added: Gaussians) -> bytes:
+    """The bytes of a scene's PLY with more Gaussians after its own, which keep their bytes."""
+    content = append_to_ply(source, added.with_harmonics_count(0))
+    assert content is not None  # a PLY of Spackle has room for every Gaussian
+    return content
+
+
+def _without(scene: SceneFile, marked: Tensor) -> SceneFile:
+    """A scene without the Gaussians that are marked [N]."""
+    kept = ~marked
+    base_count = len(marked) if scene.base_count is None else scene.base_count
+    # dataclasses.replace would keep the file's byte count, which nobody asks for here.
+    return SceneFile(
+        path=scene.path,
+        gaussians=scene.gaussians.select(kept),
+        camera=scene.camera,
+        base_count=int(kept[:base_count].sum()),
+        disparity=scene.disparity,
+        is_metric=scene.is_metric,
+    )
+
+
+def _views_around(loaded: SceneFile) -> list[Camera]:
+    """The scene's own view, and views on a circle around it, as far as the page's camera goes."""
+    scene = Scene.of_file(loaded)
+    camera = scene.camera
+    longest = max(camera.width, camera.height)
+    if longest > AROUND_SIDE_PX:
+        factor = AROUND_SIDE_PX / longest
+        camera = camera.resized(round(camera.width * factor), round(camera.height * factor))
+    disparity = DEFAULT_MAX_DISPARITY if loaded.disparity is None else loaded.disparity
+    depths = DepthRange.of(scene.base, is_metric=scene.is_metric)
+    return [camera, *trajectory_cameras("rotate", camera, disparity, depths, VIEWS_AROUND)]
+
+
+@torch.no_grad()
+def _hole_ratio(gaussians: Gaussians, camera: Camera, renderer: Renderer) -> float:
+    """The share of a view's pixels that are holes, 0..1."""
+    return float(hole_area_ratio(renderer.render(gaussians, camera).alpha))

@@ -1,0 +1,52 @@
+"""Pages in a real browser, and what they show."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+FLAGS = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Opened:
+    """A page, with console messages and requested addresses."""
+
+    page: Any
+    said: list[str]
+    asked: list[str]
+
+
+def opened(browser: Any, url: str, **screen: Any) -> Opened:
+    """A page at an address; `screen` may have its viewport, and whether it is a phone's."""
+    usual = {"viewport": {"width": 740, "height": 490}, "reduced_motion": "reduce"}
+    context = browser.new_context(**{**usual, **screen})
+    page = context.new_page()
+    page.set_default_timeout(300_000)  # ms; software draws slowly on a busy machine
+    found = Opened(page, [], [])
+    page.on("console", lambda message: found.said.append(message.text))
+    page.on("pageerror", lambda error: found.said.append(str(error)))
+    page.on("request", lambda request: found.asked.append(request.url))
+    page.goto(url)
+    return found
+
+
+def settled(page: Any, promise: str) -> None:
+    """Wait for a promise of the page, with a timeout (`evaluate` has none)."""
+    page.wait_for_function(f"{promise}.then(() => true)")
+
+
+def pixels(png: bytes) -> Tensor:
+    """[H, W, 3] in 0..1."""
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(png)).convert("RGB"))).float() / 255
