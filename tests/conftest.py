@@ -29,6 +29,7 @@ JOURNEYS = (
     "paper/evaluation/test_bench.py",
     "test_examples.py",
     "scene_fill/test_fill_scene.py",
+    "posed",
     "paper/evaluation/test_mode_paper.py",
     "paper/evaluation/test_evaluate.py",
     "paper/training/test_direct_ft.py",

@@ -44,6 +44,7 @@ ROOMS = (
     "video",
     "top",
     "results",
+    "posed",
     "clips",
     "paper",
     "web",

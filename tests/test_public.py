@@ -16,10 +16,10 @@ from spackle.cli import app
 ROOT = Path(__file__).parents[1]
 PYTHON = """
 Base BasePrediction Camera DepthMap FillContext Gaussians HfBase InputError LiteBase MogeBase
-Photo Renderer Rendering
+Photo PosedScene Renderer Rendering
 Scene SharpBase Spackle complete complete_view fill fill_scene fill_view get_renderer
 hole_area_ratio hole_mask
-load_cameras load_depth load_photo load_ply predict save_ply
+load_cameras load_depth load_photo load_ply predict predict_posed save_ply
 """
 COMMANDS = """
 bench; dataset build; dataset info; dataset preview; dataset verify; demo; evaluate; export;

@@ -30,6 +30,8 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.formats import save_ply as save_ply
     from spackle.pipeline import complete as complete
     from spackle.pipeline import fill as fill
+    from spackle.posed.predict import predict_posed as predict_posed
+    from spackle.posed.scene import PosedScene as PosedScene
     from spackle.render import Renderer as Renderer
     from spackle.render import get_renderer as get_renderer
     from spackle.render.protocol import Rendering as Rendering
@@ -62,6 +64,8 @@ _NAMES_BY_MODULE = {
     "spackle.render.protocol": ("Rendering",),
     "spackle.residual": ("complete_view", "hole_area_ratio", "hole_mask"),
     "spackle.pipeline": ("complete", "fill"),
+    "spackle.posed.predict": ("predict_posed",),
+    "spackle.posed.scene": ("PosedScene",),
     "spackle.scene": ("Scene",),
     "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view"),
     "spackle.api": ("Spackle", "predict"),

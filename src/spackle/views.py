@@ -31,7 +31,7 @@ from spackle.core.trajectories import (
 from spackle.formats.camera_files import load_path
 from spackle.formats.camera_readers import is_path_file, read_camera_set
 from spackle.formats.camera_set import CameraSet
-from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_content import SceneFile, is_at_origin
 from spackle.render.protocol import Renderer
 from spackle.residual.features import hole_area_ratio
 from spackle.runtime.errors import InputError, as_input_error, check_name
@@ -238,21 +238,29 @@ class GivenPath:
         """The views or keyframes in the world of a saved scene.
 
         A scene that was made of a photo has the photo's camera at its origin. Another program's
-        scene has a world of its own, and cameras of other programs are taken to share it.
+        scene, and one of several photos, has a world of its own, and cameras of other programs are
+        taken to share it. The result is in the world of the scene's camera, if it has one.
 
         Args:
             scene: the scene.
             photo_name: what its photo was called.
         """
-        if scene.camera is not None:
+        if scene.camera is not None and is_at_origin(scene.camera):
             return self.around_photo(photo_name)
+        to_world = torch.eye(4, dtype=torch.float64)
+        if scene.camera is not None:
+            to_world = torch.linalg.inv(scene.camera.world_to_camera.double())
 
         def in_shared_world(cameras: CameraSet) -> CameraSet:
             """The cameras as they are, with a note."""
             if cameras.origin is None:
                 return cameras
             note = f"its world is taken as that of {scene.path.name}"
-            return dataclasses.replace(cameras, notes=(*cameras.notes, note))
+            moved = [
+                dataclasses.replace(camera, world_to_camera=camera.world_to_camera @ to_world)
+                for camera in cameras.cameras
+            ]
+            return dataclasses.replace(cameras, cameras=tuple(moved), notes=(*cameras.notes, note))
 
         return self._in_world(in_shared_world)
 

@@ -50,9 +50,19 @@ if TYPE_CHECKING:  # torch takes seconds to load
 def predict(
     *,
     photos: Annotated[
-        list[Path],
-        typer.Argument(metavar="PHOTO...", help="Photos, folders of photos, or one clip."),
-    ],
+        list[Path] | None,
+        typer.Argument(
+            metavar="PHOTO...", help="Photos, folders of photos, or one clip.", show_default=False
+        ),
+    ] = None,
+    posed: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="One scene of all photos of a folder, which also holds their cameras: COLMAP's, "
+            "transforms.json of nerfstudio, or a capture of Record3D or Polycam; see docs/fill.md.",
+        ),
+    ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
     ] = Path("out"),
@@ -277,10 +287,33 @@ def predict(
         workers=workers,
         threads=threads,
     )
-    failure_count = _predict_all(photos, output, options, CommandReporter(verbose, as_json=as_json))
+    reporter = CommandReporter(verbose, as_json=as_json)
+    if posed is not None:
+        from spackle.posed.predict import predict_posed_folder
+
+        _check_suits_posed(posed, photos, trajectory, overscan)
+        predict_posed_folder(posed, output, options, reporter)
+        return
+    if not photos:
+        raise InputError("no photo: give photos, folders of photos, one clip, or --posed FOLDER")
+    failure_count = _predict_all(photos, output, options, reporter)
     # The errors have been printed already, one for each photo.
     if failure_count:
         raise typer.Exit(1)
+
+
+def _check_suits_posed(
+    posed: Path, photos: list[Path] | None, trajectory: str | None, overscan: float | None
+) -> None:
+    """InputError for arguments that contradict a folder of photos with known cameras."""
+    if photos:
+        raise InputError(
+            f"{photos[0]}: --posed {posed} names the photos: leave one of them out, "
+            "or give one folder after --posed"
+        )
+    if trajectory is not None or overscan is not None:
+        option = "--trajectory" if trajectory is not None else "--overscan"
+        raise InputError(f"{option}: with --posed the camera goes through the photos: leave it out")
 
 
 def _predict_all(

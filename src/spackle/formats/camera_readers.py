@@ -104,6 +104,7 @@ class _NerfFile(_NerfLens):
     """nerfstudio's transforms.json."""
 
     frames: Annotated[list[_NerfFrame], Field(min_length=1, max_length=MAX_FRAMES)]
+    ply_file_path: str | None = None  # sparse points, in the world of the frames
 
 
 class _DataparserFile(BaseModel):
@@ -311,17 +312,15 @@ def _read_nerfstudio(path: Path, content: Any) -> CameraSet:
     """
     file = _validated(_NerfFile, content, path)
     notes = []
-    dataparser_path = path.parent / DATAPARSER_NAME
-    dataparser = None
-    if dataparser_path.is_file():
-        dataparser = _validated(_DataparserFile, _peek(dataparser_path), dataparser_path)
+    dataparser = _dataparser_beside(path)
+    if dataparser is not None:
         notes.append(f"moved and scaled as {DATAPARSER_NAME} says")
 
     cameras = []
     for index, frame in enumerate(file.frames):
         where = f"{path}: frame {index}"
         # What a frame does not say holds for all frames.
-        lens = file.model_dump(exclude={"frames"}, exclude_unset=True)
+        lens = file.model_dump(exclude={"frames", "ply_file_path"}, exclude_unset=True)
         lens |= frame.model_dump(
             exclude={"file_path", "transform_matrix"}, exclude_unset=True, exclude_none=True
         )
@@ -342,6 +341,35 @@ def _read_nerfstudio(path: Path, content: Any) -> CameraSet:
         origin=OPENGL_TO_OPENCV,
         notes=tuple(notes),
     )
+
+
+def _dataparser_beside(path: Path) -> _DataparserFile | None:
+    """Return how nerfstudio moved and scaled the scene of a transforms.json; None if it did not."""
+    dataparser_path = path.parent / DATAPARSER_NAME
+    if not dataparser_path.is_file():
+        return None
+    return _validated(_DataparserFile, _peek(dataparser_path), dataparser_path)
+
+
+def nerfstudio_points(path: Path) -> tuple[Path, Tensor] | None:
+    """Return the file of sparse points that nerfstudio's transforms.json names.
+
+    Args:
+        path: a file that `read_camera_set` has read.
+
+    Returns:
+        The file, and the matrix [4, 4] from its world to that of the cameras; None if the cameras'
+        file names no points, or they are not there.
+    """
+    content = _peek(path)
+    name = content.get("ply_file_path") if isinstance(content, dict) else None
+    if not isinstance(name, str) or not (path.parent / name).is_file():
+        return None
+    to_world = torch.eye(4, dtype=torch.float64)
+    dataparser = _dataparser_beside(path)
+    if dataparser is not None:
+        to_world[:3] = dataparser.scale * _four_rows(dataparser.transform)[:3]
+    return path.parent / name, to_world
 
 
 def _has_distortion(lens: _NerfLens) -> bool:

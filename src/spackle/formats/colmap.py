@@ -1,8 +1,8 @@
-"""COLMAP's models, text or binary: the lenses, and the poses of the photos.
+"""COLMAP's models, text or binary: the lenses, the poses of the photos, and the points.
 
 A model is a sparse reconstruction in three files: cameras (lenses), images (a pose for each
-photo, and where the photo sees points) and points3D, which is not read here. A generator reads the
-records of each file. Newer versions of COLMAP write rigs and frames besides, which are not needed.
+photo, and where the photo sees points) and points3D. A generator reads the records of each file.
+Newer versions of COLMAP write rigs and frames besides, which are not needed.
 """
 
 from __future__ import annotations
@@ -59,6 +59,9 @@ OTHER_MODELS = {
 # Lens models with one focal length; the others have fx and fy.
 SINGLE_FOCAL_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
+MAX_REPROJECTION_ERROR_PX = 2.0  # of a point, as mean over photos
+MAX_EXACT_INTEGER = 2**53  # the largest id that float64 holds exactly
+
 # Where a photo sees a point; the id -1 means that the position belongs to no point.
 OBSERVATION_DTYPE = np.dtype([("uv", "<f8", (2,)), ("id", "<i8")])
 
@@ -80,6 +83,16 @@ class ImageRecord(NamedTuple):
     camera_key: int
     name: str
     observations: Array  # [n] of `OBSERVATION_DTYPE`
+
+
+class PointRecord(NamedTuple):
+    """A point in the file of points."""
+
+    key: float
+    x: float
+    y: float
+    z: float
+    error_px: float  # mean reprojection error
 
 
 def find_model(scene: Path, folders: tuple[str, ...] = MODEL_FOLDERS) -> Path | None:
@@ -146,6 +159,45 @@ def is_binary_model(folder: Path) -> bool:
 def images_path(folder: Path) -> Path:
     """Return the file of a model's photos."""
     return folder / f"images{'.bin' if is_binary_model(folder) else '.txt'}"
+
+
+def points_path(folder: Path) -> Path:
+    """Return the file of a model's points."""
+    return folder / f"points3D{'.bin' if is_binary_model(folder) else '.txt'}"
+
+
+def read_points(folder: Path) -> tuple[Array, Array]:
+    """Read the reliable points of a model's folder: those with a small reprojection error.
+
+    Returns:
+        ids: [m] int64, ascending and without repetitions.
+        xyz: [m, 3] float64 positions in the world.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    path = points_path(folder)
+    with as_input_error(path, DAMAGED):
+        return _reliable_points(_points_bin(path) if is_binary_model(folder) else _points_txt(path))
+
+
+def _reliable_points(records: Iterator[PointRecord]) -> tuple[Array, Array]:
+    """The points of a model with a small reprojection error.
+
+    Returns:
+        ids: [m] int64, ascending and without repetitions.
+        xyz: [m, 3] float64 positions in the world.
+    """
+    rows = [record for record in records if record.error_px <= MAX_REPROJECTION_ERROR_PX]
+    table = np.array(rows, np.float64).reshape(-1, 5)  # key, x, y, z, error
+
+    # Beyond these limits for id, x, y and z a file is damaged: float64 does not hold the id
+    # exactly, or no camera is that far away.
+    limits = [MAX_EXACT_INTEGER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER]
+    table = table[(np.abs(table[:, :4]) <= limits).all(axis=1)]
+
+    ids, first_rows = np.unique(table[:, 0], return_index=True)
+    return ids.astype(np.int64), table[first_rows, 1:4]
 
 
 def _lens_of_record(path: Path, record: CameraRecord) -> Lens:
@@ -252,6 +304,22 @@ def _images_bin(path: Path) -> Iterator[ImageRecord]:
         offset = observations_start + observation_count * OBSERVATION_DTYPE.itemsize
 
 
+def _points_bin(path: Path) -> Iterator[PointRecord]:
+    """Yield the points of a points3D.bin.
+
+    A record is key (uint64), x, y, z (float64), colour (3 bytes), error in pixels (float64), the
+    number of photos that see the point (uint64), and for each of these two int32.
+    """
+    data = path.read_bytes()
+    (count,) = struct.unpack_from("<Q", data)
+    offset = 8  # bytes of the number of records
+    for _ in range(count):
+        # "3x" skips the colour.
+        key, x, y, z, error_px, photo_count = struct.unpack_from("<Q3d3xdQ", data, offset)
+        yield PointRecord(key, x, y, z, error_px)
+        offset += 51 + 8 * photo_count  # 8 + 3 · 8 + 3 + 8 + 8 bytes, and the photos
+
+
 # --- the records of text files: lines of words; lines with # are comments
 
 
@@ -295,3 +363,12 @@ def _images_txt(path: Path) -> Iterator[ImageRecord]:
         yield ImageRecord(
             [float(word) for word in pose], int(camera_key), name.strip(), observations
         )
+
+
+def _points_txt(path: Path) -> Iterator[PointRecord]:
+    """Yield the points of a points3D.txt: key, x, y, z, 3 colours, error in pixels, photos."""
+    for line in text_lines(path):
+        if not line.strip():
+            continue
+        key, x, y, z, _, _, _, error_px, *_ = line.split(maxsplit=8)
+        yield PointRecord(int(key), float(x), float(y), float(z), float(error_px))

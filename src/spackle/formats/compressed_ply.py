@@ -92,7 +92,7 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
         NewTable(name="chunk", row_count=len(chunks), type="float", properties=CHUNK_PROPERTIES),
         NewTable(name="vertex", row_count=len(vertices), type="uint", properties=PACKED_PROPERTIES),
         *harmonics_tables,
-        camera=scene.camera_at_origin,
+        camera=scene.camera,
         base_count=scene.base_count,
         disparity=scene.disparity,
         is_metric=scene.is_metric,

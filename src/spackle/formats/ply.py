@@ -84,7 +84,7 @@ def save_ply(
     Args:
         gaussians: the scene.
         path: the file to write, whole or not at all.
-        camera: the photo's camera, at the world's origin.
+        camera: the photo's camera, at the world's origin or elsewhere.
         base_count: how many Gaussians come from the photo; those that fill holes come after.
         disparity: how far to the side the camera may go, because the holes that it uncovers are
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal.
@@ -107,7 +107,7 @@ def encode_ply(scene: SceneFile) -> bytes:
     """
     parts = _encode_parts(
         scene.gaussians,
-        scene.camera_at_origin,
+        scene.camera,
         scene.base_count,
         scene.disparity,
         scene.is_metric,
@@ -327,7 +327,8 @@ class PlyFile:
     def camera(self) -> Camera | None:
         """Read the photo's camera.
 
-        `save_ply` stores it in the comment "spackle_camera". SHARP, another program that turns a
+        `save_ply` stores it in the comments "spackle_camera" and, if it is not at the world's
+        origin, "spackle_pose". SHARP, another program that turns a
         photo into Gaussians, stores it in the tables "intrinsic", "extrinsic" and "image_size".
 
         Returns:
@@ -341,7 +342,11 @@ class PlyFile:
         if numbers is not None:
             fx, fy, cx, cy, width, height = numbers
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-            return self._checked_camera(K, np.eye(4), width, height)
+            pose = np.eye(4)
+            rows = self._tables.numbers_in_comment("spackle_pose", count=12, lowest=-math.inf)
+            if rows is not None:
+                pose[:3] = np.reshape(rows, (3, 4))
+            return self._checked_camera(K, pose, width, height)
 
         extras = self._small_columns()
         if "intrinsic" not in extras:

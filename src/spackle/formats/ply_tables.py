@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
@@ -72,7 +73,7 @@ def ply_header(
 
     Args:
         tables: the file's tables, in their order.
-        camera: the photo's camera, at the world's origin.
+        camera: the photo's camera; its pose is a comment of its own, unless it is at the origin.
         base_count: how many Gaussians come from the photo; those that fill holes come after.
         disparity: how far to the side the camera may go, because the holes that it uncovers are
             filled; a disparity of 1 shifts the nearest surface by the picture's diagonal.
@@ -84,6 +85,10 @@ def ply_header(
         numbers = [*camera.focal, *principal_point, camera.width, camera.height]
         # repr() writes as many digits as the exact number needs.
         lines.append("comment spackle_camera " + " ".join(repr(number) for number in numbers))
+        pose = camera.world_to_camera.double()
+        if not torch.equal(pose, torch.eye(4).to(pose)):
+            rows = pose[:3].flatten().tolist()  # the last row is always 0 0 0 1
+            lines.append("comment spackle_pose " + " ".join(repr(number) for number in rows))
     if base_count is not None:
         lines.append(f"comment spackle_base {base_count!r}")
     if disparity is not None:

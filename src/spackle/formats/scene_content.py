@@ -80,16 +80,6 @@ class SceneFile:
             losses.append(harmonics_loss(self.harmonics_degree, kept_degree))
         return losses
 
-    @property
-    def camera_at_origin(self) -> Camera | None:
-        """The camera if it is at the world's origin and looks along z, else None.
-
-        A comment in a PLY file has no room for another pose.
-        """
-        if self.camera is None or not is_at_origin(self.camera):
-            return None
-        return self.camera
-
 
 def is_at_origin(camera: Camera) -> bool:
     """Return whether a camera is at the world's origin and looks along z, without a tilt."""

@@ -209,7 +209,7 @@ def predict_photos(
 
     # Two runs over many photos must not share a folder. A single photo locks only its own folder,
     # so that several may be predicted at once.
-    shared_digest = _shared_digest(options)
+    shared_digest = options_digest(options)
     with results_folder(output, locked=not is_single):
         for line in left_out:
             reporter.log(line)
@@ -436,7 +436,7 @@ class Predictor:
         return json_digest([self.shared_digest, *fingerprints])
 
 
-def _shared_digest(options: PredictOptions) -> str:
+def options_digest(options: PredictOptions) -> str:
     """A digest of everything that the results of all photos depend on, beside the photo itself.
 
     These are Spackle's version, the options, and the content of the files that options name. If the

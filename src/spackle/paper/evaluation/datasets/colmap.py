@@ -1,34 +1,32 @@
 """Read COLMAP models, text or binary: cameras, points, and the points that each photo sees.
 
 A model is a sparse reconstruction in three files: cameras (lenses), images (a pose for each
-photo, and where the photo sees points) and points3D. `read_model` reads all three; the records of
-the first two are read by `formats/colmap.py`.
+photo, and where the photo sees points) and points3D. `read_model` reads all three, by the readers
+of `formats/colmap.py`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
-from spackle.formats.camera_files import MAX_CAMERA_NUMBER, checked_camera
+from spackle.formats.camera_files import checked_camera
 from spackle.formats.colmap import (
     DAMAGED,
     ImageRecord,
     Lens,
     images_path,
-    is_binary_model,
     pose_of_image,
     read_images,
     read_lenses,
-    text_lines,
+    read_points,
 )
 from spackle.paper.evaluation.case import Points
 from spackle.runtime.errors import InputError, as_input_error
@@ -38,18 +36,6 @@ Array = NDArray[Any]
 # The greatest accepted distortion at a photo's corner, as a fraction of the long side. Smaller
 # distortion is ignored, because photos from close viewpoints are distorted alike.
 MAX_DISTORTION_RATIO = 0.02
-MAX_REPROJECTION_ERROR_PX = 2.0  # of a point, as mean over photos
-MAX_EXACT_INTEGER = 2**53  # the largest id that float64 holds exactly
-
-
-class PointRecord(NamedTuple):
-    """A point in the file of points."""
-
-    key: float
-    x: float
-    y: float
-    z: float
-    error_px: float  # mean reprojection error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,13 +78,9 @@ def read_model(folder: Path) -> Model:
     Raises:
         InputError: a file is missing or damaged, or a lens differs too much from a pinhole.
     """
-    is_binary = is_binary_model(folder)
-    # Each file has its own block, so that a message names the damaged file.
-    points_path = folder / f"points3D{'.bin' if is_binary else '.txt'}"
-    with as_input_error(points_path, DAMAGED):
-        point_records = _points_bin(points_path) if is_binary else _points_txt(points_path)
-        point_ids, xyz = _reliable_points(point_records)
+    point_ids, xyz = read_points(folder)
 
+    # Each file has its own block, so that a message names the damaged file.
     lenses = read_lenses(folder)
     for lens in lenses.values():
         _check_distortion(folder, lens)
@@ -110,25 +92,6 @@ def read_model(folder: Path) -> Model:
 
     views.sort(key=lambda view: view.name)
     return Model(tuple(views), point_ids, xyz)
-
-
-def _reliable_points(records: Iterator[PointRecord]) -> tuple[Array, Array]:
-    """The points of a model with a small reprojection error.
-
-    Returns:
-        ids: [m] int64, ascending and without repetitions.
-        xyz: [m, 3] float64 positions in the world.
-    """
-    rows = [record for record in records if record.error_px <= MAX_REPROJECTION_ERROR_PX]
-    table = np.array(rows, np.float64).reshape(-1, 5)  # key, x, y, z, error
-
-    # Beyond these limits for id, x, y and z a file is damaged: float64 does not hold the id
-    # exactly, or no camera is that far away.
-    limits = [MAX_EXACT_INTEGER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER]
-    table = table[(np.abs(table[:, :4]) <= limits).all(axis=1)]
-
-    ids, first_rows = np.unique(table[:, 0], return_index=True)
-    return ids.astype(np.int64), table[first_rows, 1:4]
 
 
 def _check_distortion(folder: Path, lens: Lens) -> None:
@@ -203,31 +166,3 @@ def _view_of_record(path: Path, lens: Camera, record: ImageRecord) -> ColmapView
     _, first_indices = np.unique(observations["id"], return_index=True)
     observations = observations[first_indices]
     return ColmapView(record.name, camera, observations["uv"].copy(), observations["id"].copy())
-
-
-# --- the records of binary files: little endian; a file begins with the number of its records
-
-
-def _points_bin(path: Path) -> Iterator[PointRecord]:
-    """Yield the points of a points3D.bin.
-
-    A record is key (uint64), x, y, z (float64), colour (3 bytes), error in pixels (float64), the
-    number of photos that see the point (uint64), and for each of these two int32.
-    """
-    data = path.read_bytes()
-    (count,) = struct.unpack_from("<Q", data)
-    offset = 8  # bytes of the number of records
-    for _ in range(count):
-        # "3x" skips the colour.
-        key, x, y, z, error_px, photo_count = struct.unpack_from("<Q3d3xdQ", data, offset)
-        yield PointRecord(key, x, y, z, error_px)
-        offset += 51 + 8 * photo_count  # 8 + 3 · 8 + 3 + 8 + 8 bytes, and the photos
-
-
-def _points_txt(path: Path) -> Iterator[PointRecord]:
-    """Yield the points of a points3D.txt: key, x, y, z, 3 colours, error in pixels, photos."""
-    for line in text_lines(path):
-        if not line.strip():
-            continue
-        key, x, y, z, _, _, _, error_px, *_ = line.split(maxsplit=8)
-        yield PointRecord(int(key), float(x), float(y), float(z), float(error_px))
