@@ -11,6 +11,7 @@ from helpers.scenes import psnr
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.posed.exposure import gains_of_photos, with_gain
 from spackle.posed.union import PlacedPhoto, Union, merge_photos
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio
@@ -104,3 +105,34 @@ def test_a_single_photo_stays_as_it_is() -> None:
     union = merge_photos([placed(1)], RENDERER)
     assert torch.equal(union.gaussians.means, placed(1).gaussians.means)
     assert (union.doubled, union.contradicted) == (0, 0)
+
+
+def dimmed(photo: PlacedPhoto, factor: torch.Tensor) -> PlacedPhoto:
+    """The photo as if it had been exposed for less light of each colour."""
+    colors = photo.gaussians.colors * factor
+    gaussians = dataclasses.replace(photo.gaussians, colors=colors)
+    return PlacedPhoto.of(gaussians, photo.camera, photo.error, RENDERER)
+
+
+def test_exposure_and_white_balance_become_those_of_the_first_photo() -> None:
+    factor = torch.tensor([0.7, 0.6, 0.8])
+    photos = [placed(2), dimmed(placed(0), factor)]
+    gains = gains_of_photos(photos)
+    assert torch.equal(gains[0], torch.ones(3).double())
+    assert torch.allclose(gains[1], 1 / factor.double(), rtol=0.04)
+    evened = [with_gain(photo, gain) for photo, gain in zip(photos, gains, strict=True)]
+    # The left part of the left photo's own view is seen by no other photo.
+    truth = view(EYES[0]).rgb
+    fidelity = []
+    for versions in (photos, evened):
+        rendering = RENDERER.render(merge_photos(versions, RENDERER).gaussians, placed(0).camera)
+        covered = rendering.alpha > 0.95
+        fidelity.append(psnr(rendering.rgb[covered], truth[covered]))
+    assert fidelity[1] > fidelity[0] + 2
+
+
+def test_photos_of_equal_exposure_keep_their_colours() -> None:
+    photos = [placed(1), placed(0), placed(2)]
+    gains = gains_of_photos(photos)
+    assert torch.equal(gains, torch.ones(3, 3).double())
+    assert with_gain(photos[1], gains[1]) is photos[1]

@@ -45,7 +45,8 @@ def gains_of_photos(photos: Sequence[PlacedPhoto]) -> Tensor:
     log_gains = torch.linalg.solve(normal, right_side)
     log_gains = (log_gains - log_gains[0]).clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN)
     is_same = log_gains.abs().amax(dim=1, keepdim=True) < LEAST_CHANGE
-    return log_gains.where(~is_same, 0.0).exp()
+    kept_gains: Tensor = log_gains.where(~is_same, 0.0).exp()
+    return kept_gains
 
 
 def _log_ratio(photo: PlacedPhoto, other: PlacedPhoto) -> tuple[Tensor, float]:
@@ -71,6 +72,4 @@ def with_gain(photo: PlacedPhoto, gain: Tensor) -> PlacedPhoto:
     if bool((gain == 1).all()):
         return photo
     colors = (photo.gaussians.colors * gain.to(photo.gaussians.colors)).clamp(max=1)
-    return dataclasses.replace(
-        photo, gaussians=dataclasses.replace(photo.gaussians, colors=colors)
-    )
+    return dataclasses.replace(photo, gaussians=dataclasses.replace(photo.gaussians, colors=colors))

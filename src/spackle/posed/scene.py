@@ -30,6 +30,7 @@ from spackle.posed.correction import (
     fit_correction,
     move_gaussians,
 )
+from spackle.posed.exposure import gains_of_photos, with_gain
 from spackle.posed.matching import match_depths
 from spackle.posed.path import central_first, focus_depth, path_through, views_to_fill
 from spackle.posed.union import MIN_ALPHA, PlacedPhoto, Union, merge_photos
@@ -137,7 +138,13 @@ def complete_posed(
             PlacedPhoto.of(photo.gaussians, photo.camera, photo.error, pipeline.renderer)
             for photo in photos
         ]
+        gains = gains_of_photos(placed)
+        placed = [with_gain(photo, gain) for photo, gain in zip(placed, gains, strict=True)]
         union = merge_photos(placed, pipeline.renderer)
+    for photo, gain in zip(photos, gains.tolist(), strict=True):
+        if gain != [1.0, 1.0, 1.0]:
+            factors = ", ".join(f"{factor:.2f}" for factor in gain)
+            reporter.log(f"{photo.file.path.name}: red, green, blue times {factors}, as the others")
     total = sum(len(photo.gaussians) for photo in photos)
     reporter.log(
         f"{len(photos)} photos together: {len(union.gaussians):,} of {total:,} Gaussians; "

@@ -22,7 +22,7 @@ SAME_SURFACE_ERRORS = 2.0
 MIN_TOLERANCE = 0.02
 MAX_TOLERANCE = 0.06
 # Where a Gaussian may be on its ray, as shares of the tolerance.
-PIECE_STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+PIECE_STEPS = (0.0, -0.5, 0.5, -1.0, 1.0)  # the likeliest place first
 # A photo of a later rank must see a surface this much more finely to replace one of an earlier
 # rank: seams lie where photos end, and not where two of them are about equally good.
 RANK_PENALTY = 0.5
@@ -36,13 +36,16 @@ class PlacedPhoto:
     camera: Camera  # float32, in the world
     depth: Tensor  # [H, W] rendered from its own Gaussians, in the world's unit
     alpha: Tensor  # [H, W] of the same rendering
+    rgb: Tensor  # [H, W, 3] sRGB of the same rendering
     error: float  # median relative error of its depths
 
     @staticmethod
     def of(gaussians: Gaussians, camera: Camera, error: float, renderer: Renderer) -> PlacedPhoto:
         """A photo with the depth that its Gaussians have in its own view."""
         rendering = renderer.render(gaussians, camera).to(torch.device("cpu"))
-        return PlacedPhoto(gaussians, camera, rendering.depth, rendering.alpha, error)
+        return PlacedPhoto(
+            gaussians, camera, rendering.depth, rendering.alpha, rendering.rgb, error
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +80,7 @@ def merge_photos(photos: Sequence[PlacedPhoto], renderer: Renderer) -> Union:
         for other_rank, other in enumerate(photos):
             if other_rank == rank:
                 continue
-            view = _seen_in(photo, other)
+            view = evidence_of(photo, other)
             is_contradicted |= view.sees_through
             other_cost = _cost(other.camera, photo.gaussians.means, other_rank)
             is_doubled |= view.same_surface & (other_cost < own_cost)
@@ -101,14 +104,17 @@ def _cost(camera: Camera, means: Tensor, rank: int) -> Tensor:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Evidence:
-    """What a photo says about the Gaussians of another one, [N] bool each."""
+class Evidence:
+    """What a photo says about the N Gaussians of another one."""
 
-    same_surface: Tensor  # it sees a surface at the same depth
-    sees_through: Tensor  # its surface is farther away: there is nothing at the Gaussian's place
+    same_surface: Tensor  # [N] bool: it sees a surface at the same depth
+    # [N] bool: its surface is farther away, so there is nothing at the Gaussian's place
+    sees_through: Tensor
+    row: Tensor  # [N] the pixel in which it sees the surface; any pixel if it does not
+    column: Tensor
 
 
-def _seen_in(photo: PlacedPhoto, other: PlacedPhoto) -> _Evidence:
+def evidence_of(photo: PlacedPhoto, other: PlacedPhoto) -> Evidence:
     """What the photo `other` says about the Gaussians of `photo`.
 
     A Gaussian's depth is uncertain, so it may be anywhere on a short piece of its ray. The other
@@ -122,15 +128,21 @@ def _seen_in(photo: PlacedPhoto, other: PlacedPhoto) -> _Evidence:
     rays = photo.gaussians.means - eye
     same_surface = torch.zeros(len(rays), dtype=torch.bool)
     sees_through = torch.ones(len(rays), dtype=torch.bool)
+    surface_row = torch.zeros(len(rays), dtype=torch.long)
+    surface_column = surface_row.clone()
     for step in PIECE_STEPS:
         uv, z = other.camera.project(eye + (1 + step * tolerance) * rays)
         is_inside, row, column = _pixels(uv, z, other.camera)
         knows = is_inside & (other.alpha[row, column] >= MIN_ALPHA)
         lies_before = z < nearest[row, column] * (1 - tolerance)
         lies_behind = z > farthest[row, column] * (1 + tolerance)
-        same_surface |= knows & ~lies_before & ~lies_behind
+        is_same = knows & ~lies_before & ~lies_behind
+        is_first = is_same & ~same_surface
+        surface_row = row.where(is_first, surface_row)
+        surface_column = column.where(is_first, surface_column)
+        same_surface |= is_same
         sees_through &= knows & lies_before
-    return _Evidence(same_surface, sees_through)
+    return Evidence(same_surface, sees_through, surface_row, surface_column)
 
 
 def _depth_bounds(photo: PlacedPhoto) -> tuple[Tensor, Tensor]:
