@@ -107,8 +107,11 @@ def test_a_second_run_does_nothing_and_a_killed_one_leaves_nothing(
     with monkeypatch.context() as patch:
         patch.setattr("spackle.posed.predict.save_video", killed)
         assert run(*command).code == 130
-    assert not (tmp_path / "out" / "room").exists() or not names_in(tmp_path / "out" / "room")
-    assert run(*command).code == 0
+    assert not POSED_FILES & names_in(tmp_path / "out" / "room")
+    resumed = run(*command)
+    assert resumed.code == 0
+    assert resumed.err.count("predicted by an earlier run") == 3
+    assert names_in(tmp_path / "out" / "room") == POSED_FILES
     report = (tmp_path / "out" / "room" / "report.json").read_bytes()
     again = run(*command)
     assert "done already" in again.err

@@ -20,6 +20,7 @@ from spackle.bases.settings import AUTO, BaseSettings
 from spackle.formats import save_ply
 from spackle.pipeline import FillOptions, Pipeline, PipelineOptions
 from spackle.posed.capture import Capture, read_capture
+from spackle.posed.kept_predictions import KeptPredictions
 from spackle.posed.path import path_seconds
 from spackle.posed.scene import PosedScene, complete_posed
 from spackle.render import get_renderer
@@ -36,6 +37,7 @@ from spackle.views import MAX_FRAME_COUNT
 
 SCENE_FILE = "scene.ply"
 CAMERAS_FILE = "cameras.json"
+KEPT_PREFIX = ".predicted-"  # folders of predictions, which are deleted once a scene is complete
 DEFAULT_PATH_FRAMES = 120  # of a scene that Python asks for
 
 
@@ -111,8 +113,14 @@ def predict_posed_folder(
             reporter.result({"folder": results, "done_already": True})
             return
 
+        # Predictions of another request do not fit this one.
+        kept = KeptPredictions(results / f"{KEPT_PREFIX}{request[:16]}")
         scene = complete_posed(
-            capture, pipeline, reporter, frame_count=_frame_count(options, len(capture.photos))
+            capture,
+            pipeline,
+            reporter,
+            frame_count=_frame_count(options, len(capture.photos)),
+            kept=kept,
         )
         with atomic_files(results, REPORT_NAME) as new_folder:
             video = _write_files(scene, capture, new_folder, video_name, options, reporter)
@@ -122,6 +130,8 @@ def predict_posed_folder(
             files = sorted(file for file in new_folder.rglob("*") if file.is_file())
             report["files"] = file_records(new_folder, files)
             write_json(report, new_folder / REPORT_NAME)
+        for folder_of_kept in results.glob(f"{KEPT_PREFIX}*"):
+            KeptPredictions(folder_of_kept).remove()
 
     before = sum(view.before for view in scene.holes) / len(scene.holes)
     after = sum(view.after for view in scene.holes) / len(scene.holes)

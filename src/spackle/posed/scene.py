@@ -31,10 +31,12 @@ from spackle.posed.correction import (
     move_gaussians,
 )
 from spackle.posed.exposure import gains_of_photos, with_gain
+from spackle.posed.kept_predictions import KeptPredictions
 from spackle.posed.matching import match_depths
 from spackle.posed.path import central_first, focus_depth, path_through, views_to_fill
 from spackle.posed.union import MIN_ALPHA, PlacedPhoto, Union, merge_photos
 from spackle.residual import hole_area_ratio
+from spackle.runtime.digests import file_fingerprint, json_digest
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Reporter
@@ -113,7 +115,12 @@ class PosedScene:
 
 
 def complete_posed(
-    capture: Capture, pipeline: Pipeline, reporter: Reporter, *, frame_count: int = 120
+    capture: Capture,
+    pipeline: Pipeline,
+    reporter: Reporter,
+    *,
+    frame_count: int = 120,
+    kept: KeptPredictions | None = None,
 ) -> PosedScene:
     """Turn photos with known cameras into one completed scene.
 
@@ -122,6 +129,7 @@ def complete_posed(
         pipeline: base, network and renderer.
         reporter: gets messages and progress, and times the stages.
         frame_count: number of views of the path.
+        kept: predictions of an earlier run that was killed, to which those of this one are added.
 
     Raises:
         InputError: a photo, depth map or point file cannot be used, or depths fit no photo.
@@ -130,7 +138,7 @@ def complete_posed(
         reporter.log(note)
 
     # photos --> base --> Gaussians --> at known depths
-    photos = align_photos(capture, pipeline, reporter)
+    photos = align_photos(capture, pipeline, reporter, kept)
 
     # --> merged
     with reporter.stage("merge"):
@@ -208,8 +216,15 @@ def _measure(
     return tuple(holes)
 
 
-def align_photos(capture: Capture, pipeline: Pipeline, reporter: Reporter) -> list[AlignedPhoto]:
+def align_photos(
+    capture: Capture,
+    pipeline: Pipeline,
+    reporter: Reporter,
+    kept: KeptPredictions | None = None,
+) -> list[AlignedPhoto]:
     """Predict each photo, and bring its Gaussians to known depths; the most central photo first.
+
+    Predictions that are in `kept` are not made again, and new ones are added to it.
 
     Raises:
         InputError: a photo cannot be used, or the points fit no photo.
@@ -224,13 +239,9 @@ def align_photos(capture: Capture, pipeline: Pipeline, reporter: Reporter) -> li
     failures: list[str] = []
     with reporter.stage("photos") as progress:
         for index, (file, photo) in enumerate(zip(files, loaded, strict=True)):
-            prediction, base = pipeline.base.predict(
-                photo, file.depth if _lifts_depth(pipeline) else None, log=reporter.warn
-            )
-            if base.note:
-                reporter.log(f"{photo.path.name}: {base.note}")
+            prediction, base_name = _predict(file, photo, pipeline, reporter, kept)
             camera = _camera_at_size(file.camera, prediction.camera)
-            if base.name == RGBD:
+            if base_name == RGBD:
                 found = None
                 source = "depth map"
             else:
@@ -244,7 +255,7 @@ def align_photos(capture: Capture, pipeline: Pipeline, reporter: Reporter) -> li
                     failures.append(f"{photo.path.name}: {problem} ({source})")
                     progress(index + 1, len(files))
                     continue
-            aligned = _aligned(file, prediction, camera, found, source, base.name)
+            aligned = _aligned(file, prediction, camera, found, source, base_name)
             reporter.log(aligned.line)
             photos.append(aligned)
             progress(index + 1, len(files))
@@ -258,6 +269,29 @@ def align_photos(capture: Capture, pipeline: Pipeline, reporter: Reporter) -> li
             "check that photos and cameras belong together"
         )
     return photos
+
+
+def _predict(
+    file: PosedFile,
+    photo: Photo,
+    pipeline: Pipeline,
+    reporter: Reporter,
+    kept: KeptPredictions | None,
+) -> tuple[BasePrediction, str]:
+    """What the base makes of a photo, and the base's name; from an earlier run if it was kept."""
+    key = json_digest([file.name, file_fingerprint(file.path, "photo")])
+    if kept is not None:
+        earlier = kept.load(key)
+        if earlier is not None:
+            reporter.log(f"{photo.path.name}: predicted by an earlier run")
+            return earlier
+    depth = file.depth if _lifts_depth(pipeline) else None
+    prediction, base = pipeline.base.predict(photo, depth, log=reporter.warn)
+    if base.note:
+        reporter.log(f"{photo.path.name}: {base.note}")
+    if kept is not None:
+        kept.save(key, prediction, base.name)
+    return prediction, base.name
 
 
 def _lifts_depth(pipeline: Pipeline) -> bool:
