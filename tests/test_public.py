@@ -19,7 +19,7 @@ Base BasePrediction Camera DepthMap FillContext Gaussians HfBase InputError Lite
 Photo PosedScene Renderer Rendering
 Scene SharpBase Spackle complete complete_view fill fill_scene fill_view get_renderer
 hole_area_ratio hole_mask
-load_cameras load_depth load_photo load_ply predict predict_posed save_ply
+load_cameras load_depth load_photo load_ply marked_gaussians predict predict_posed remove save_ply
 """
 COMMANDS = """
 bench; dataset build; dataset info; dataset preview; dataset verify; demo; evaluate; export;

@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.formats import save_ply as save_ply
     from spackle.pipeline import complete as complete
     from spackle.pipeline import fill as fill
+    from spackle.pipeline import remove as remove
     from spackle.posed.predict import predict_posed as predict_posed
     from spackle.posed.scene import PosedScene as PosedScene
     from spackle.render import Renderer as Renderer
@@ -43,6 +44,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.scene_fill import FillContext as FillContext
     from spackle.scene_fill import fill_scene as fill_scene
     from spackle.scene_fill import fill_view as fill_view
+    from spackle.scene_fill import marked_gaussians as marked_gaussians
 
 __version__ = "0.1.0"  # pyproject.toml reads this line
 
@@ -63,11 +65,11 @@ _NAMES_BY_MODULE = {
     "spackle.render": ("Renderer", "get_renderer"),
     "spackle.render.protocol": ("Rendering",),
     "spackle.residual": ("complete_view", "hole_area_ratio", "hole_mask"),
-    "spackle.pipeline": ("complete", "fill"),
+    "spackle.pipeline": ("complete", "fill", "remove"),
     "spackle.posed.predict": ("predict_posed",),
     "spackle.posed.scene": ("PosedScene",),
     "spackle.scene": ("Scene",),
-    "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view"),
+    "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view", "marked_gaussians"),
     "spackle.api": ("Spackle", "predict"),
 }
 _MODULE_OF_NAME = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names}

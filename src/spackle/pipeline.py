@@ -43,6 +43,7 @@ from spackle.runtime.progress import Progress, Reporter
 from spackle.scene import Scene, SceneReport, ViewHoles
 from spackle.scene_fill.context import FillContext
 from spackle.scene_fill.fill import fill_scene, fill_view
+from spackle.scene_fill.removal import uncovered_pixels
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
 from spackle.views import GivenPath, PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed_weights
@@ -600,6 +601,66 @@ def fill(
         fillable=fillable,
     )
     return Gaussians.cat([gaussians, completed.aux.transform(from_first)])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Removal:
+    """A scene without a thing: as it is left, and with what the thing hid filled in."""
+
+    is_kept: Tensor  # [N] bool, of the given Gaussians
+    edited: Gaussians  # those that are kept, bit for bit
+    patched: Gaussians  # the same, and then those that were added where the thing was
+
+
+def remove(
+    gaussians: Gaussians,
+    marked: Tensor,
+    cameras: Sequence[Camera],
+    *,
+    network: ResidualNet | Literal["shipped"] | None = "shipped",
+    texture: str = "auto",
+    renderer: Renderer | None = None,
+    progress: Progress | None = None,
+) -> Removal:
+    """Take Gaussians out of a scene, and fill what they hid, as cameras see it.
+
+    Holes that were there before stay as they were, and where the thing stood before nothing,
+    nothing is filled in.
+
+    Args:
+        gaussians: the scene, N Gaussians in any frame.
+        marked: [N] bool, those to take out, such as `marked_gaussians` finds.
+        cameras: the views to fill, in the scene's frame. The first one should see what the thing
+            hid; it stands for the photo of a scene that was made from a photo.
+        network: as for `fill`.
+        texture: as for `fill`.
+        renderer: as for `fill`.
+        progress: as for `fill`.
+
+    Raises:
+        ValueError: `marked` marks nothing or everything, or there are no cameras.
+    """
+    if tuple(marked.shape) != (len(gaussians),) or marked.dtype != torch.bool:
+        raise ValueError(f"`marked` must be [{len(gaussians)}] bool")
+    if not bool(marked.any()):
+        raise ValueError("`marked` marks no Gaussian")
+    if bool(marked.all()):
+        raise ValueError("`marked` marks all Gaussians: nothing would be left to fill from")
+    if not cameras:
+        raise ValueError("`cameras` is empty: give the views to fill")
+    renderer = renderer or get_renderer()
+    is_kept = ~marked.to(gaussians.means.device)
+    edited = gaussians.select(is_kept)
+    patched = fill(
+        edited,
+        cameras,
+        network=network,
+        texture=texture,
+        renderer=renderer,
+        progress=progress,
+        fillable=uncovered_pixels(gaussians, edited, cameras, renderer),
+    )
+    return Removal(is_kept=is_kept, edited=edited, patched=patched)
 
 
 def _check_fillable(fillable: Sequence[Tensor | None], cameras: Sequence[Camera]) -> None:

@@ -3,6 +3,7 @@
 from spackle.scene_fill.context import FillContext
 from spackle.scene_fill.fill import FilledScene, FilledView, fill_scene, fill_view
 from spackle.scene_fill.occlusion_guard import OcclusionGuard
+from spackle.scene_fill.removal import marked_gaussians
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
 from spackle.scene_fill.view_completion import SceneViewCompletion
 
@@ -16,5 +17,6 @@ __all__ = [
     "exemplar_texture",
     "fill_scene",
     "fill_view",
+    "marked_gaussians",
     "painted_texture",
 ]

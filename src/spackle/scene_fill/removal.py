@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.color import srgb_to_linear
+from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
+from spackle.core.hole_filling import fill_from_far_side
+from spackle.render import get_renderer
 from spackle.render.protocol import Renderer, Rendering
 from spackle.residual.features import hole_mask
 from spackle.scene_fill.background_depth import background_depth
@@ -27,17 +29,25 @@ FRINGE_RATIO = 0.002
 NOISE_SIGMAS = 3.0
 MIN_MARGIN = 0.01
 MAX_MARGIN = 0.05
+CONTACT_RATIO = 0.06  # relative distance of a thing from the surface behind it, where it touches it
+MAX_COLOR_RATIO = 0.7  # of the distances in colour from the thing and from what surrounds it
+OUTLINE_RATIO = 0.1  # relative distance of a thing from the background that makes an outline
+OUTLINE_PX = 2  # how far from an outline pixels show both the thing and the background
+MAX_FOOT_RATIO = 0.04  # of the picture's diagonal: as far as a foot is looked for at most
 # A Gaussian whose share of all pixels together is smaller does not show; only its place counts.
 MIN_VISIBLE_PX = 0.1
 MIN_SHARE = 0.5  # of what shows of a Gaussian must lie in the thing
 # If less of a mask shows something in front of the background, the mask marks a part of a surface,
 # such as a poster on a wall.
 MIN_THING_SHARE = 0.05
+MAX_EMPTY_SHARE = 0.05  # of a view's pixels; a view with less emptiness has a background
 GREY = 0.5  # colour of all Gaussians while it is measured in which pixels they show
 
 
 def marked_gaussians(
-    gaussians: Gaussians, marks: Sequence[tuple[Camera, Tensor]], renderer: Renderer
+    gaussians: Gaussians,
+    marks: Sequence[tuple[Camera, Tensor]],
+    renderer: Renderer | None = None,
 ) -> Tensor:
     """[N] bool: the Gaussians of the thing that masks mark.
 
@@ -49,13 +59,14 @@ def marked_gaussians(
         gaussians: N Gaussians.
         marks: cameras in the scene's frame, each with its mask [H, W] bool, true on the thing. A
             mask may be larger than the thing.
-        renderer: renders the scene as the cameras see it.
+        renderer: by default the best of this machine, on its GPU if it has one.
 
     Raises:
         ValueError: there are no marks, or a mask has another size than its camera.
     """
     if not marks:
         raise ValueError("`marks` is empty: give a camera and its mask")
+    renderer = renderer or get_renderer()
     device = gaussians.means.device
     gaussians = gaussians.detach().with_harmonics_count(0).to(renderer.device)
     is_marked = torch.zeros(len(gaussians), dtype=torch.bool)
@@ -69,6 +80,35 @@ def marked_gaussians(
         is_marked |= marked
         is_refused |= refused
     return (is_marked & ~is_refused).to(device)
+
+
+@torch.no_grad()
+def uncovered_pixels(
+    before: Gaussians, after: Gaussians, cameras: Sequence[Camera], renderer: Renderer
+) -> list[Tensor]:
+    """[H, W] bool for each camera: the holes that a removal has made and that should be filled.
+
+    They were opaque before. Where the thing stood before nothing, such as the sky of a scene that
+    has none, its place stays empty: the emptiness around it is continued into it.
+
+    Args:
+        before: the whole scene.
+        after: the scene without the thing.
+        cameras: the views, in the scene's frame. If the first one sees hardly any emptiness, there
+            is a background everywhere.
+        renderer: renders the views.
+    """
+    holes_before = [hole_mask(renderer.render(before, camera).alpha).cpu() for camera in cameras]
+    has_background = float(holes_before[0].float().mean()) < MAX_EMPTY_SHARE
+    uncovered = []
+    for camera, was_open in zip(cameras, holes_before, strict=True):
+        opened = hole_mask(renderer.render(after, camera).alpha).cpu() & ~was_open
+        if not has_background and not bool(opened.all()):
+            openness = was_open.float()
+            _, continued = fill_from_far_side(openness, openness[None], ~opened, far_bias=0.0)
+            opened &= continued[0] < 0.5  # nearer to something than to nothing
+        uncovered.append(opened)
+    return uncovered
 
 
 def _votes(
@@ -87,6 +127,7 @@ def _votes(
     wide_mask = maximum_filter(mask, max(1, fringe_px))
     thing, background, margin = _thing_in_picture(rendering, wide_mask)
     fringe = maximum_filter(thing, fringe_px) & wide_mask & ~thing
+    fringe |= _foot(thing, rendering, background, margin, 2 * margin) & wide_mask & ~thing
     if int(thing.sum()) < MIN_THING_SHARE * int(mask.sum()):
         fringe = mask
 
@@ -109,18 +150,51 @@ def _votes(
 
     # Of a Gaussian that shows, what shows decides, because it may reach over the outline. Of one
     # that is hidden, only the centre is known.
-    shown, shown_in_thing, shown_in_fringe = _shown_pixels(
-        gaussians, camera, [torch.ones_like(mask), thing | fringe, fringe], renderer
+    shown, shown_in_thing = _shown_pixels(
+        gaussians, camera, [torch.ones_like(mask), thing | fringe], renderer
     )
     is_visible = shown > MIN_VISIBLE_PX
     mostly_in_thing = shown_in_thing > MIN_SHARE * shown
-    mostly_in_fringe = shown_in_fringe > MIN_SHARE * shown
-    is_own = in_front & torch.where(is_visible, mostly_in_thing, is_masked)
-    is_fringe = is_visible & mostly_in_fringe
-    is_marked = is_own | is_fringe
+    # The surface of the background shines through a thing a little, but lies behind its surface.
+    on_surface = z < at_center(rendering.depth) * (1 + margin)
+    is_own = is_visible & mostly_in_thing & (in_front | on_surface)
+    is_inner = ~is_visible & is_masked & in_front
+    # Beneath the surface of a thing often lies a second layer of it, which where the thing stands
+    # on a floor is no longer in front of the floor. There, the colour tells it from the floor.
+    contact = _foot(thing, rendering, background, margin, CONTACT_RATIO)
+    is_contact = is_masked & at_center(contact)
+    is_near_floor = z * at_center(background) < 1 + CONTACT_RATIO
+    has_color = _has_color_of_thing(gaussians, index, rendering, wide_mask)
+    is_layer = ~is_visible & is_contact & is_near_floor & has_color
+    is_marked = is_own | is_inner | is_layer
 
     is_refused = is_inside & ~is_masked & ~is_marked
     return is_marked, is_refused
+
+
+def _has_color_of_thing(
+    gaussians: Gaussians, index: Tensor, rendering: Rendering, wide_mask: Tensor
+) -> Tensor:
+    """[N] bool: the Gaussians whose colour is nearer to what a view shows at their place than to
+    the colours around the mask.
+
+    Args:
+        gaussians: N Gaussians.
+        index: [N] the place of each one's pixel in the picture, row by row.
+        rendering: the view.
+        wide_mask: [H, W] bool.
+    """
+    shown = rendering.rgb.flatten(0, 1)[index]  # [N, 3]
+    if bool(wide_mask.all()):
+        return torch.ones_like(index, dtype=torch.bool)
+    flat = torch.ones(wide_mask.shape)  # all colours around the mask count alike
+    _, around = fill_from_far_side(flat, rendering.rgb.movedim(-1, 0), ~wide_mask, far_bias=0.0)
+    around_there = around.movedim(0, -1).flatten(0, 1)[index]  # [N, 3]
+    own = linear_to_srgb(gaussians.colors.cpu())
+    from_thing = (own - shown).norm(dim=-1)
+    from_around = (own - around_there).norm(dim=-1)
+    has_color: Tensor = from_thing < MAX_COLOR_RATIO * from_around
+    return has_color
 
 
 def _thing_in_picture(rendering: Rendering, wide_mask: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -142,6 +216,37 @@ def _thing_in_picture(rendering: Rendering, wide_mask: Tensor) -> tuple[Tensor, 
     in_front = nearness > behind.inverse_depth * (1 + margin)
     thing = wide_mask & in_front & (rendering.alpha > 0)
     return thing, behind.inverse_depth, margin
+
+
+def _foot(
+    thing: Tensor, rendering: Rendering, background: Tensor, margin: float, height: float
+) -> Tensor:
+    """[H, W] bool: the pixels in which a thing may touch the surface that it stands on.
+
+    Where a thing rises from a floor, it is hardly nearer than the floor behind it, so depth cannot
+    tell the two apart. This ends where the floor has receded by the margin.
+
+    Args:
+        thing: [H, W] bool: the pixels in which the thing is in front of the background.
+        rendering: the view.
+        background: [H, W] inverse depth behind the thing.
+        margin: by which ratio the thing is in front of the background at least.
+        height: by which ratio the foot is in front of the background at most.
+    """
+    nearness = 1 / rendering.depth.clamp_min(1e-30)
+    rising = thing & (nearness < background * (1 + height))
+    # At an outline before a far background, too, pixels lie between the two depths: they show both.
+    is_far_in_front = nearness > background * (1 + OUTLINE_RATIO)
+    rising &= ~maximum_filter(is_far_in_front, OUTLINE_PX)
+    if not bool(rising.any()):
+        return rising
+    # How fast the background recedes from row to row and column to column, relative to its depth.
+    logarithm = background.clamp_min(1e-30).log()
+    down, right = torch.gradient(logarithm)
+    recession = float(torch.hypot(down, right)[rising].median())
+    largest_px = MAX_FOOT_RATIO * math.hypot(*thing.shape)
+    reach_px = largest_px if recession <= 0 else min(largest_px, margin / recession)
+    return maximum_filter(rising, math.ceil(reach_px))
 
 
 def _shown_pixels(
