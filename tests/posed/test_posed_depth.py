@@ -100,7 +100,7 @@ def test_moved_gaussians_are_the_image_of_the_map_of_space() -> None:
     true_camera.K[0, 2] += 3
     generator = torch.Generator().manual_seed(2)
     field = 0.2 * torch.randn(FIELD_NODES, generator=generator).double()
-    correction = DepthCorrection(0.7, 0.05, field)
+    correction = DepthCorrection(0.7, 0.05, field, first_layer=0.1, last_layer=0.6)
     gaussians = random_gaussians(40, dtype=torch.float64)
 
     def moved(points: torch.Tensor) -> torch.Tensor:
@@ -127,7 +127,7 @@ def test_moved_gaussians_are_the_image_of_the_map_of_space() -> None:
 def test_an_unchanged_photo_keeps_the_shapes_of_its_gaussians() -> None:
     camera = Camera.from_focal(90.0, 100, 80)
     gaussians = random_gaussians(40)
-    unchanged = DepthCorrection(1.0, 0.0, torch.zeros(2, 2))
+    unchanged = DepthCorrection(1.0, 0.0, torch.zeros(2, 2, 2))
     result = move_gaussians(gaussians, unchanged, camera, camera)
     assert torch.allclose(result.means, gaussians.means, atol=1e-6)
     assert torch.allclose(result.covariances(), gaussians.covariances(), atol=1e-6)

@@ -8,6 +8,7 @@ between the two, `move_gaussians` applies it.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from torch import Tensor
@@ -27,38 +28,56 @@ FIRST_DEVIATION = 0.2
 # A shift of inverse depth must pay: weight of its square against the points' relative errors.
 SHIFT_PENALTY = 1e-4
 MIN_KEPT_RATIO = 0.25  # a shift leaves at least this share of the scaled inverse depth
-FIELD_NODES = (10, 13)  # rows and columns of the field of factors over a photo
-# Weights of the field's bends and of its size, for a mean number of one point to a node.
-BEND_PENALTY = 0.1
-SIZE_PENALTY = 0.01
+# Nodes of the field of factors: layers of inverse depth, rows and columns over the photo. Layers,
+# because points on a wall say nothing about a plain column before it.
+FIELD_NODES = (4, 10, 13)
+# The layers reach between these quantiles of the photo's inverse depth.
+LAYER_QUANTILES = (0.05, 0.95)
+# Weights against bends within a layer, against steps and bends from layer to layer, and against
+# large factors, where the mean number of points to a node of one layer is one. Chosen by true
+# depths of rendered scenes: docs/fill.md.
+BEND_PENALTY = 0.05
+STEP_PENALTY = 0.02
+LAYER_BEND_PENALTY = 0.05
+SIZE_PENALTY = 0.003
+MAX_SAMPLES = 100_000  # pixels from which the layers' range is estimated
 MAX_FIELD = 0.7  # largest log factor of the field: a factor of two
 
 
 @dataclasses.dataclass(frozen=True)
 class DepthCorrection:
-    """A map of depths in a photo: 1/z' = exp(field at the pixel) · (scale / z + shift)."""
+    """A map of depths in a photo: 1/z' = exp(field) · (scale / z + shift).
+
+    The field changes smoothly over the photo, and from near to far.
+    """
 
     scale: float
     shift: float  # 1 / unit of the world
-    # [rows, columns] log factors on a regular grid, whose outer nodes lie at the photo's corners.
+    # [layers, rows, columns] log factors on a regular grid. The outer rows and columns lie at the
+    # photo's border; the layers are equally spaced in scale / z + shift.
     field: Tensor
+    first_layer: float = 0.0  # scale / z + shift of the first layer, which is the farthest
+    last_layer: float = 1.0
 
     def inverse_depth(self, inverse: Tensor, place: Tensor) -> Tensor:
         """The corrected inverse depth [N], positive wherever `inverse` [N] is.
 
         `place` [N, 2] is the pixel's x and y, from 0 to 1 over the photo.
         """
-        scaled = self.scale * inverse
-        shifted = torch.maximum(scaled + self.shift, MIN_KEPT_RATIO * scaled)
-        return self._factors(place) * shifted
+        shifted = self.shifted_inverse_depth(inverse)
+        # `grid_sample` takes x, y and layer as -1..1, and repeats the border beyond it.
+        nearness = (shifted - self.first_layer) / (self.last_layer - self.first_layer)
+        position = 2 * torch.cat([place, nearness[:, None]], dim=1) - 1  # [N, 3]
+        field = self.field.to(place)[None, None]  # [1, 1, layers, rows, columns]
+        logs = grid_sample(
+            field, position[None, None, None], padding_mode="border", align_corners=True
+        )
+        return logs[0, 0, 0, 0].exp() * shifted
 
-    def _factors(self, place: Tensor) -> Tensor:
-        """The field's factors [N] at places [N, 2] of 0..1, linear between nodes in their logs."""
-        # `grid_sample` takes -1..1, and repeats the border beyond it.
-        grid = (2 * place - 1)[None, None]  # [1, 1, N, 2]
-        field = self.field.to(place)[None, None]  # [1, 1, rows, columns]
-        logs = grid_sample(field, grid, padding_mode="border", align_corners=True)
-        return logs[0, 0, 0].exp()
+    def shifted_inverse_depth(self, inverse: Tensor) -> Tensor:
+        """scale / z + shift of inverse depths [N], kept above a quarter of scale / z."""
+        scaled = self.scale * inverse
+        return torch.maximum(scaled + self.shift, MIN_KEPT_RATIO * scaled)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,12 +137,21 @@ def fit_correction(
 
     # First one scale and shift for the whole photo, then what a smooth field can still explain.
     scale, shift = _fit_scale_and_shift(inverse, known_inverse)
-    flat = torch.zeros(FIELD_NODES, dtype=torch.float64)
-    correction = DepthCorrection(scale, shift, flat)
+    correction = DepthCorrection(scale, shift, torch.zeros(FIELD_NODES, dtype=torch.float64))
     if with_field:
+        every_inverse = 1 / base_depth[is_known].double()
+        step = max(1, len(every_inverse) // MAX_SAMPLES)
+        shifted = correction.shifted_inverse_depth(every_inverse[::step])
+        low, high = (float(shifted.quantile(share)) for share in LAYER_QUANTILES)
+        if high > low:
+            correction = dataclasses.replace(correction, first_layer=low, last_layer=high)
         # log(known / predicted) is what the field should be at each point.
         missing = (known_inverse / correction.inverse_depth(inverse, place)).log()
-        correction = DepthCorrection(scale, shift, _fit_field(missing, place))
+        nearness = (correction.shifted_inverse_depth(inverse) - correction.first_layer) / (
+            correction.last_layer - correction.first_layer
+        )
+        field = _fit_field(missing, place, nearness)
+        correction = dataclasses.replace(correction, field=field)
 
     errors = (correction.inverse_depth(inverse, place) / known_inverse - 1).abs()
     deviation = _deviation(errors)
@@ -175,43 +203,62 @@ def _fit_scale_and_shift(inverse: Tensor, known_inverse: Tensor) -> tuple[float,
     return fitted_scale, fitted_shift * float(unit)
 
 
-def _fit_field(missing: Tensor, place: Tensor) -> Tensor:
-    """[rows, columns] log factors that explain `missing` [N] at places [N, 2] of 0..1, smoothly."""
-    rows, columns = FIELD_NODES
-    sampling = _bilinear_weights(place)  # [N, rows · columns]
-    # With few points to a node, the bends cost more than what they explain.
-    mean_weight = len(missing) / (rows * columns)
-    bends = _bend_rows()
-    smoothness = BEND_PENALTY * bends.T @ bends + SIZE_PENALTY * torch.eye(rows * columns)
-    field = torch.zeros(rows * columns, dtype=torch.float64)
+def _fit_field(missing: Tensor, place: Tensor, nearness: Tensor) -> Tensor:
+    """The smooth field [layers, rows, columns] that explains known log factors.
+
+    Args:
+        missing: [N] the log factors.
+        place: [N, 2] x and y of 0..1 where they are known.
+        nearness: [N] 0 at the first layer, 1 at the last one.
+    """
+    layers, rows, columns = FIELD_NODES
+    by_layer = _shares(nearness, layers)[:, :, None, None]
+    by_row = _shares(place[:, 1], rows)[:, None, :, None]
+    by_column = _shares(place[:, 0], columns)[:, None, None, :]
+    sampling = (by_layer * by_row * by_column).flatten(1)  # [N, nodes]
+
+    # More points may bend the field more, but twice as many do not say twice as much.
+    weight_of_points = 1 / max(1.0, len(missing) / (rows * columns)) ** 0.5
+    smoothness = _smoothness()
+    field = torch.zeros(sampling.shape[1], dtype=torch.float64)
     for fit_round in range(FIT_ROUNDS):
-        weights = _weights(sampling @ field - missing, fit_round)
-        normal = sampling.T @ (sampling * weights[:, None]) / max(1.0, mean_weight) ** 0.5
-        right_side = sampling.T @ (weights * missing) / max(1.0, mean_weight) ** 0.5
-        field = torch.linalg.solve(normal + smoothness, right_side)
-    return field.clamp(-MAX_FIELD, MAX_FIELD).reshape(rows, columns)
+        weights = weight_of_points * _weights(sampling @ field - missing, fit_round)
+        normal = sampling.T @ (sampling * weights[:, None])
+        field = torch.linalg.solve(normal + smoothness, sampling.T @ (weights * missing))
+    return field.clamp(-MAX_FIELD, MAX_FIELD).reshape(FIELD_NODES)
 
 
-def _bilinear_weights(place: Tensor) -> Tensor:
-    """[N, nodes] the share of each of the field's nodes at places [N, 2] of 0..1."""
-    rows, columns = FIELD_NODES
-    x = place[:, 0].clamp(0, 1) * (columns - 1)
-    y = place[:, 1].clamp(0, 1) * (rows - 1)
-    # The share of a node falls from 1 to 0 over the distance to its neighbours.
-    across = (1 - (x[:, None] - torch.arange(columns)).abs()).clamp(min=0)  # [N, columns]
-    down = (1 - (y[:, None] - torch.arange(rows)).abs()).clamp(min=0)  # [N, rows]
-    return (down[:, :, None] * across[:, None, :]).flatten(1)
+def _shares(position: Tensor, count: int) -> Tensor:
+    """[N, count] the share of each of equally spaced nodes at positions [N] of 0..1.
+
+    A node's share falls from 1 to 0 over the distance to its neighbours.
+    """
+    steps = position.clamp(0, 1)[:, None] * (count - 1)
+    return (1 - (steps - torch.arange(count)).abs()).clamp(min=0)
 
 
-def _bend_rows() -> Tensor:
-    """[bends, nodes] second differences along the rows and columns of the field, and across."""
-    rows, columns = FIELD_NODES
-    nodes = torch.eye(rows * columns, dtype=torch.float64).reshape(rows, columns, -1)
-    along_columns = nodes[:-2] - 2 * nodes[1:-1] + nodes[2:]
-    along_rows = nodes[:, :-2] - 2 * nodes[:, 1:-1] + nodes[:, 2:]
-    twist = nodes[1:, 1:] - nodes[1:, :-1] - nodes[:-1, 1:] + nodes[:-1, :-1]
-    parts = [along_columns, along_rows, 2**0.5 * twist]
-    return torch.cat([part.reshape(-1, rows * columns) for part in parts])
+def _smoothness() -> Tensor:
+    """[nodes, nodes] the quadratic form by which a field costs: bends, steps and size."""
+    count = math.prod(FIELD_NODES)
+    nodes = torch.eye(count, dtype=torch.float64).reshape(*FIELD_NODES, count)
+    down = nodes[:, :-2] - 2 * nodes[:, 1:-1] + nodes[:, 2:]
+    across = nodes[:, :, :-2] - 2 * nodes[:, :, 1:-1] + nodes[:, :, 2:]
+    twist = nodes[:, 1:, 1:] - nodes[:, 1:, :-1] - nodes[:, :-1, 1:] + nodes[:, :-1, :-1]
+    step = nodes[1:] - nodes[:-1]
+    layer_bend = nodes[:-2] - 2 * nodes[1:-1] + nodes[2:]
+    weighted = [
+        (BEND_PENALTY, down),
+        (BEND_PENALTY, across),
+        (2 * BEND_PENALTY, twist),  # a twist counts along both directions
+        (STEP_PENALTY, step),
+        (LAYER_BEND_PENALTY, layer_bend),
+        (SIZE_PENALTY, nodes),
+    ]
+    cost = torch.zeros(count, count, dtype=torch.float64)
+    for weight, differences in weighted:
+        rows = differences.reshape(-1, count)
+        cost += weight * rows.T @ rows
+    return cost
 
 
 def move_gaussians(

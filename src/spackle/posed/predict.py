@@ -115,13 +115,17 @@ def predict_posed_folder(
 
         # Predictions of another request do not fit this one.
         kept = KeptPredictions(results / f"{KEPT_PREFIX}{request[:16]}")
-        scene = complete_posed(
-            capture,
-            pipeline,
-            reporter,
-            frame_count=_frame_count(options, len(capture.photos)),
-            kept=kept,
-        )
+        try:
+            scene = complete_posed(
+                capture,
+                pipeline,
+                reporter,
+                frame_count=_frame_count(options, len(capture.photos)),
+                kept=kept,
+            )
+        except InputError:
+            kept.remove()  # other points or photos will be another request
+            raise
         with atomic_files(results, REPORT_NAME) as new_folder:
             video = _write_files(scene, capture, new_folder, video_name, options, reporter)
             report = _report_of(scene, capture, options, reporter)

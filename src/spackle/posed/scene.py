@@ -344,7 +344,7 @@ def _aligned(
     base_name: str,
 ) -> AlignedPhoto:
     """A photo with its Gaussians moved to known depths; without a correction they stay."""
-    unchanged = DepthCorrection(1.0, 0.0, torch.zeros(2, 2, dtype=torch.float64))
+    unchanged = DepthCorrection(1.0, 0.0, torch.zeros(2, 2, 2, dtype=torch.float64))
     correction = unchanged if found is None else found.correction
     own = move_gaussians(prediction.gaussians, correction, prediction.camera, camera)
     camera_to_world = torch.linalg.inv(camera.world_to_camera.double())
