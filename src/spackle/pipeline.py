@@ -43,6 +43,7 @@ from spackle.runtime.progress import Progress, Reporter
 from spackle.scene import Scene, SceneReport, ViewHoles
 from spackle.scene_fill.context import FillContext
 from spackle.scene_fill.fill import fill_scene, fill_view
+from spackle.scene_fill.fill_plan import Background, FillPlan, plan_fill
 from spackle.scene_fill.removal import uncovered_pixels
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
 from spackle.views import GivenPath, PathOptions, PlannedViews, choose_disparity, plan_views
@@ -54,6 +55,10 @@ FILL_TEXTURES: tuple[str, ...] = get_args(FillTexture)
 # One set of aux Gaussians for all views; one set for each view; or one set for each view by the
 # paper's method alone, without what Spackle adds to it.
 FillMode = Literal["scene", "view", "paper"]
+
+
+# Given views stand anywhere, so that many of them must protect what they show.
+MAX_GUARDED_VIEWS = 32
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -500,7 +505,6 @@ def complete(
     fill: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
-    fillable: Sequence[Tensor | None] | None = None,
 ) -> Scene:
     """Fill the holes of all views by one set of Gaussians, which are added to the base's.
 
@@ -513,8 +517,6 @@ def complete(
         fill: where the texture comes from, see `open_texture`; "none" keeps the holes.
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
-        fillable: for each view the pixels [H, W] bool whose holes may be filled, or None for all;
-            None: all holes of all views.
     """
     context = FillContext.of(
         prediction,
@@ -524,7 +526,7 @@ def complete(
     )
     views_to_fill = cameras if fill != "none" else ()
     start = time.perf_counter()
-    filled = fill_scene(context, views_to_fill, exact=exact, progress=progress, fillable=fillable)
+    filled = fill_scene(context, views_to_fill, exact=exact, progress=progress)
     report = SceneReport(
         focal_px=prediction.camera.focal[0],
         focal_source=prediction.lens_source or None,
@@ -543,64 +545,109 @@ def fill(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     *,
+    background: Background = "keep",
+    fillable: Sequence[Tensor | None] | None = None,
+    photo_camera: Camera | None = None,
     network: ResidualNet | Literal["shipped"] | None = "shipped",
     texture: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
-    fillable: Sequence[Tensor | None] | None = None,
 ) -> Gaussians:
     """A scene of any program with Gaussians added where its cameras see holes.
 
     The first Gaussians of the result are the given ones, bit for bit, with their harmonics; those
-    that were added come after them. Nothing that the first camera sees is hidden by them.
+    that were added come after them. What a camera sees already is not hidden by them.
 
     Args:
         gaussians: the scene, in any frame.
         cameras: the views to fill, in the scene's frame (x right, y down, z forward at each
-            camera). The first one stands for the photo of a scene that was made from a photo.
+            camera).
+        background: "keep": sky and empty space around the scene stay empty, and holes that
+            surfaces enclose are filled; "fill": everything empty is filled. A photo's scene and a
+            room have no background, so that both words give the same.
+        fillable: for each camera the pixels [H, W] bool whose holes are filled, or None for all;
+            other holes stay open, and are no source of colour. It replaces `background`.
+        photo_camera: of the photo from which the scene was made; None: the camera that sees most
+            stands for it.
         network: the network that improves the added Gaussians, by default Spackle's; None adds
             them without a network.
         texture: where the texture comes from, as `fill` of `complete`.
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
-        fillable: for each camera the pixels [H, W] bool whose holes may be filled, or None for
-            all; None: all holes of all cameras. Other holes stay open, and are no source of colour.
 
     Raises:
-        ValueError: there are no cameras, or `fillable` does not fit them.
+        ValueError: there are no cameras, `fillable` does not fit them, or `background` is unknown.
     """
     if not cameras:
         raise ValueError("`cameras` is empty: give the views to fill")
+    if background not in get_args(Background):
+        raise ValueError(f"unknown `background` {background!r}: give keep or fill")
     if fillable is not None:
         _check_fillable(fillable, cameras)
+    renderer = renderer or get_renderer()
+    plan = plan_fill(
+        gaussians,
+        cameras,
+        renderer,
+        background=background,
+        fillable=fillable,
+        photo_camera=photo_camera,
+    )
+    return fill_as_planned(
+        gaussians,
+        cameras,
+        plan,
+        renderer,
+        network=network,
+        texture=texture,
+        progress=progress,
+    )
+
+
+def fill_as_planned(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    plan: FillPlan,
+    renderer: Renderer,
+    *,
+    network: ResidualNet | Literal["shipped"] | None = "shipped",
+    texture: str = "auto",
+    progress: Progress | None = None,
+) -> Gaussians:
+    """`fill` for views about which `plan_fill` has decided; see there for the arguments."""
+    if not any(plan.hole_ratios):
+        return gaussians
 
     # Completion starts from a photo's camera at the world's origin.
-    to_first = cameras[0].world_to_camera.double()
-    from_first = torch.linalg.inv(to_first)
-    moved_cameras = [
-        dataclasses.replace(camera, world_to_camera=camera.world_to_camera.double() @ from_first)
-        for camera in cameras
-    ]
-    moved_cameras[0] = dataclasses.replace(
-        cameras[0], world_to_camera=torch.eye(4, dtype=torch.float64)
-    )
+    to_photo = plan.photo_camera.world_to_camera.double()
+    from_photo = torch.linalg.inv(to_photo)
+
+    def moved(camera: Camera) -> Camera:
+        """A camera in the world of the photo's camera."""
+        pose = camera.world_to_camera.double() @ from_photo
+        if camera is plan.photo_camera:
+            pose = torch.eye(4, dtype=torch.float64)  # without rounding errors
+        return dataclasses.replace(camera, world_to_camera=pose).to(dtype=torch.float32)
+
     prediction = BasePrediction(
-        gaussians.transform(to_first),
-        moved_cameras[0].to(dtype=torch.float32),
-        notes={},
-        is_metric=False,
+        gaussians.transform(to_photo), moved(plan.photo_camera), notes={}, is_metric=False
     )
-    completed = complete(
+    context = FillContext.of(
         prediction,
-        [camera.to(dtype=torch.float32) for camera in moved_cameras],
-        exact=True,
-        network=network,
-        fill=texture,
-        renderer=renderer,
-        progress=progress,
-        fillable=fillable,
+        renderer,
+        shipped_network() if network == "shipped" else network,
+        texture=open_texture(texture),
     )
-    return Gaussians.cat([gaussians, completed.aux.transform(from_first)])
+    filled = fill_scene(
+        context,
+        [moved(camera) for camera in cameras] if texture != "none" else (),
+        exact=True,
+        progress=progress,
+        fillable=plan.fillable,
+        keep_empty=plan.keep_empty,
+        guarded_views=MAX_GUARDED_VIEWS,
+    )
+    return Gaussians.cat([gaussians, filled.aux.transform(from_photo)])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

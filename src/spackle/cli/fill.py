@@ -3,33 +3,84 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from spackle.cli.options import DeviceOption, JsonOption
+from spackle.cli.options import DeviceOption, JsonOption, TrajectoryName
 
 
 def fill(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
-    cameras: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE",
-            help="The views to fill, in the scene's world: Spackle's cameras, transforms.json of "
-            "nerfstudio, cameras.json of 3DGS, a COLMAP folder and others, see docs/inputs.md.",
-        ),
-    ],
     output: Annotated[
         Path,
         typer.Option("-o", "--output", metavar="FILE", help="Output file, such as filled.ply."),
     ],
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The views to fill, in the scene's world: Spackle's cameras, transforms.json of "
+            "nerfstudio, cameras.json of 3DGS, a COLMAP folder and others, see docs/inputs.md.",
+            show_default="a path around the scene's own camera",
+        ),
+    ] = None,
+    from_camera: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="CAMERA",
+            help="Fill a path around this camera of --cameras, a picture's name or a number from "
+            "0, in place of all its views.",
+        ),
+    ] = None,
+    trajectory: Annotated[
+        TrajectoryName | None,
+        typer.Option(help="The path around one camera.", show_default="rotate-forward"),
+    ] = None,
+    disparity: Annotated[
+        float | None,
+        typer.Option(
+            help="How far that path goes to the side, as a disparity from 0 to 2; 0.3 is large.",
+            show_default="the scene's own, or 0.3",
+        ),
+    ] = None,
+    up: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIRECTION",
+            help="The scene's upward direction, such as -y or 0,-1,0: fill 12 views all around it. "
+            "For scenes without any camera.",
+        ),
+    ] = None,
+    background: Annotated[
+        Literal["keep", "fill"],
+        typer.Option(
+            help="keep: sky and empty space around the scene stay empty; fill: everything empty "
+            "is filled."
+        ),
+    ] = "keep",
     device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Fill a scene of any program where cameras see holes; its own Gaussians do not change."""
     # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
+    from spackle.results.fill_views import FillViewsOptions
     from spackle.results.filled_scene import fill_saved_scene
 
-    fill_saved_scene(scene, output, cameras, CommandReporter(as_json=as_json), device=device)
+    views = FillViewsOptions(
+        cameras=cameras,
+        from_camera=from_camera,
+        trajectory=trajectory,
+        disparity=disparity,
+        up=up,
+    )
+    fill_saved_scene(
+        scene,
+        output,
+        views,
+        CommandReporter(as_json=as_json),
+        background=background,
+        device=device,
+    )

@@ -20,7 +20,7 @@ from spackle.runtime.progress import Reporter
 applications: list[typer.Typer] = []
 
 # All other flags are the Python name with hyphens, such as --depth-kind for `depth_kind`.
-FLAGS_WITH_ANOTHER_NAME = {"windows_per_batch": "--sharp-windows"}
+FLAGS_WITH_ANOTHER_NAME = {"windows_per_batch": "--sharp-windows", "from_camera": "--from"}
 
 
 def with_flags(message: str) -> str:

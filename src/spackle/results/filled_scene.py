@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -14,90 +15,101 @@ from spackle.formats.ply import encode_ply
 from spackle.formats.ply_append import append_to_ply
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import Encoder, encoder_for, load_scene
-from spackle.pipeline import fill
+from spackle.pipeline import fill_as_planned
 from spackle.render import Renderer, get_renderer
-from spackle.residual import hole_area_ratio
-from spackle.results.saved_scene import log_losses, page_name
+from spackle.results.fill_views import FillViewsOptions, choose_fill_views
+from spackle.results.saved_scene import log_losses
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
-from spackle.views import PathOptions
+from spackle.scene_fill.fill import fillable_hole_ratio
+from spackle.scene_fill.fill_plan import Background, FillPlan, plan_fill
 
 
 def fill_saved_scene(
     scene_file: Path,
     output: Path,
-    cameras_file: Path,
+    views: FillViewsOptions,
     reporter: Reporter,
     *,
+    background: Background = "keep",
     device: str = "auto",
 ) -> None:
-    """Fill a scene where the cameras of a file see holes, and write it with the new Gaussians.
+    """Fill a scene where views show holes, and write it with the new Gaussians.
 
     A PLY becomes a PLY whose first rows are those of the file, byte for byte.
 
     Args:
         scene_file: the scene, in any format that is read.
         output: the file to write; its suffix sets the format.
-        cameras_file: the views, in the scene's world; the first one stands for a photo.
+        views: which views are filled.
         reporter: says what was left out, how much was filled, and what was written.
+        background: "keep": sky and empty space around the scene stay empty; "fill": they do not.
         device: of the network and the renderer.
 
     Raises:
-        InputError: a file cannot be used, or no camera sees the scene.
+        InputError: a file or option cannot be used, or no camera sees the scene.
     """
     encode = encoder_for(output)
     if os.path.realpath(output) == os.path.realpath(scene_file):
         raise InputError(f"{output}: this is the scene itself: give the output another name")
-    path = PathOptions(cameras=cameras_file).load()
+    views.check()
 
     with results_folder(output.parent, [output.name]):
         loaded = load_scene(scene_file)
         log_losses(loaded, reporter)
-        given = path.in_scene(loaded, page_name(scene_file))
-        for line in given.notes:
+        chosen = choose_fill_views(loaded, views)
+        for line in chosen.notes:
             reporter.log(line)
-        assert given.views is not None  # `cameras` gives them
-        cameras = _in_world_of_file(given.views, loaded)
 
         renderer = get_renderer(device)
-        before = _mean_hole_ratio(loaded.gaussians, cameras, renderer)
-        if before == 1:
+        plan = plan_fill(
+            loaded.gaussians,
+            chosen.cameras,
+            renderer,
+            background=background,
+            photo_camera=chosen.photo_camera,
+        )
+        if not plan.sees_scene:
             problem = f"no camera sees the scene {scene_file.name}"
-            raise InputError(f"{cameras_file}: {problem}: give cameras of its world")
-        filled = fill(loaded.gaussians, cameras, renderer=renderer)
-        after = _mean_hole_ratio(filled, cameras, renderer)
+            raise InputError(f"{views.cameras or scene_file}: {problem}: give cameras of its world")
+        with reporter.stage("fill") as progress:
+            filled = fill_as_planned(
+                loaded.gaussians, chosen.cameras, plan, renderer, progress=progress
+            )
+        before = _mean(plan.hole_ratios)
+        after = _mean(_hole_ratios(filled, chosen.cameras, plan, renderer))
         write_atomic(output, _encoded(loaded, filled, encode))
 
     aux_count = len(filled) - len(loaded.gaussians)
-    holes = f"holes {before:.1%} -> {after:.2%} of {len(cameras)} views"
+    holes = f"holes {before:.1%} -> {after:.2%} of {len(chosen.cameras)} views"
+    kept = _mean(plan.background_ratios)
+    if kept > 0:
+        holes += f"; {kept:.1%} kept empty as background, which `background` fill fills, too"
     reporter.log(f"{output}: {len(loaded.gaussians):,} + {aux_count:,} Gaussians, {holes}")
     reporter.result(
         {"file": output, "gaussians": len(filled), "added": aux_count, "before": before,
-         "after": after}
+         "after": after, "background": kept}
     )  # fmt: skip
 
 
-def _in_world_of_file(views: list[Camera], scene: SceneFile) -> list[Camera]:
-    """Cameras in the world of a scene's file.
-
-    Those around a photo are in the world of the photo's camera, which may stand elsewhere.
-    """
-    if scene.camera is None:
-        return views
-    to_photo = scene.camera.world_to_camera.double()
-    return [
-        dataclasses.replace(view, world_to_camera=view.world_to_camera.double() @ to_photo)
-        for view in views
-    ]
+def _mean(ratios: Sequence[float]) -> float:
+    """The mean of the fractions of several views."""
+    return sum(ratios) / len(ratios)
 
 
 @torch.no_grad()
-def _mean_hole_ratio(gaussians: Gaussians, cameras: list[Camera], renderer: Renderer) -> float:
-    """The mean share of the pixels of views that are holes, 0..1."""
-    ratios = [float(hole_area_ratio(renderer.render(gaussians, view).alpha)) for view in cameras]
-    return sum(ratios) / len(ratios)
+def _hole_ratios(
+    gaussians: Gaussians, cameras: Sequence[Camera], plan: FillPlan, renderer: Renderer
+) -> list[float]:
+    """The share of each view's pixels that are still holes, 0..1; background is none."""
+    ratios = []
+    for index, camera in enumerate(cameras):
+        pixels = None if plan.fillable is None else plan.fillable[index]
+        alpha = renderer.render(gaussians, camera).alpha
+        ratios.append(fillable_hole_ratio(alpha, pixels))
+    return ratios
 
 
 def _encoded(loaded: SceneFile, filled: Gaussians, encode: Encoder) -> bytes:

@@ -96,6 +96,8 @@ def fill_scene(
     exact: bool = False,
     progress: Progress | None = None,
     fillable: Sequence[Tensor | None] | None = None,
+    keep_empty: Sequence[Tensor | None] | None = None,
+    guarded_views: int = GUARDED_VIEWS,
 ) -> FilledScene:
     """Complete all views of a path with one set of Gaussians.
 
@@ -112,6 +114,9 @@ def fill_scene(
         progress: called with (number of views that are done, number of views).
         fillable: for each view the pixels [H, W] bool whose holes may be filled, or None for all;
             None: all holes of all views. Other holes stay as they are, and count as closed.
+        keep_empty: for each view the pixels [H, W] bool in which nothing may appear, such as sky;
+            None: none.
+        guarded_views: no new Gaussian may hide what so many of the widest views show.
     """
     device = context.base.means.device
     if not cameras:
@@ -119,7 +124,12 @@ def fill_scene(
 
     # Everything is done on the renderer's device; the result returns to the base's device.
     filling = _SceneFilling(
-        context.on_renderer_device, cameras, exact, fillable or [None] * len(cameras)
+        context.on_renderer_device,
+        cameras,
+        exact,
+        fillable or [None] * len(cameras),
+        keep_empty or [None] * len(cameras),
+        guarded_views,
     )
     for count, index in enumerate(filling.order, start=1):
         if filling.needs_visit(index):
@@ -139,6 +149,8 @@ class _SceneFilling:
         cameras: Sequence[Camera],
         exact: bool,
         fillable: Sequence[Tensor | None],
+        keep_empty: Sequence[Tensor | None],
+        guarded_views: int,
     ) -> None:
         """Put the views in order, render the widest ones, and guard the surfaces they show.
 
@@ -148,10 +160,13 @@ class _SceneFilling:
             exact: visit every view, and leave no hole. Otherwise a view that shows the same as a
                 visited one is left out, and invisibly small holes stay open.
             fillable: for each view the pixels [H, W] bool whose holes may be filled; None: all.
+            keep_empty: for each view the pixels [H, W] bool in which nothing may appear.
+            guarded_views: so many of the widest views protect their surfaces from the start.
         """
         self.context = context
         self.cameras = cameras
         self.fillable = fillable
+        self.keep_empty = keep_empty
         self.exact = exact
         self.max_hole_ratio = 0.0 if exact else INVISIBLE_HOLE_RATIO
 
@@ -167,11 +182,11 @@ class _SceneFilling:
         self.guards = {PHOTO: context.photo_guard()}  # by the view's index; PHOTO: the photo's
         # Renderings of the base alone, by the view's index; dropped when the view is visited.
         self.base_renderings: dict[int, Rendering] = {}
-        for index in self.order[:GUARDED_VIEWS]:
-            self.base_renderings[index] = self.renderer.render(cameras[index])
-            self.guards[index] = OcclusionGuard.of(
-                self.base_renderings[index], cameras[index], context.threshold
-            )
+        for position, index in enumerate(self.order[:guarded_views]):
+            rendering = self.renderer.render(cameras[index])
+            self.guards[index] = self._guard(index, rendering)
+            if position < GUARDED_VIEWS:  # of more views, renderings would take much memory
+                self.base_renderings[index] = rendering
 
         self.filled_views = 0
         self.aux = [Gaussians.empty()]  # everything that was added
@@ -213,7 +228,7 @@ class _SceneFilling:
         self.aux += filled.aux
         self.pending_underlays += [(index, underlay) for underlay in filled.underlays]
         self.filled_views += 1
-        self.guards[index] = OcclusionGuard.of(filled.rendering, camera, self.context.threshold)
+        self.guards[index] = self._guard(index, filled.rendering)
         self.pictures.clear()  # the added Gaussians may appear in them
 
         # The two widest views show nearly all holes. When they are filled, what lies beneath the
@@ -244,6 +259,12 @@ class _SceneFilling:
         if self.filled_views >= OPPOSITE_VIEWS and self.context.texture is not None:
             return dataclasses.replace(self.context, texture=exemplar_texture)
         return self.context
+
+    def _guard(self, index: int, rendering: Rendering) -> OcclusionGuard:
+        """What a view shows, in a rendering of it, and the emptiness that it keeps."""
+        return OcclusionGuard.of(
+            rendering, self.cameras[index], self.context.threshold, self.keep_empty[index]
+        )
 
     def _other_guards(self, index: int) -> list[OcclusionGuard]:
         """The guarded surfaces of all views but one."""

@@ -36,6 +36,9 @@ PIT_RADIUS_WIDTHS = 0.027
 # the 3×4 extrinsics row by row.
 X_ROW = 4
 Y_ROW = 8
+# Before emptiness that is kept, a Gaussian that would have to move farther than this, as a multiple
+# of its distance, is left out: it would be no continuation of a surface, but a speck elsewhere.
+MAX_SCALE_BEFORE_EMPTINESS = 4.0
 DEPTH_STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
 
 
@@ -44,11 +47,16 @@ class OcclusionGuard:
     """The farthest surface near each pixel of a view; no new Gaussian may lie in front of it."""
 
     camera: Camera
-    depth: Tensor  # [H, W] z of the farthest surface within WINDOW_RADIUS_PX; 0 in holes
+    # [H, W] z of the farthest surface within WINDOW_RADIUS_PX; 0 in holes, infinite where the view
+    # is to stay empty
+    depth: Tensor
 
     @staticmethod
     def of(
-        rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD
+        rendering: Rendering,
+        camera: Camera,
+        threshold: float = MASK_THRESHOLD,
+        keep_empty: Tensor | None = None,
     ) -> OcclusionGuard:
         """The farthest surface around each pixel of a rendered view, which new Gaussians must not
         hide.
@@ -57,10 +65,16 @@ class OcclusionGuard:
             rendering: the view [H, W], on any device.
             camera: of the view.
             threshold: pixels with a lower opacity are holes, and show no surface.
+            keep_empty: [H, W] bool: pixels in which nothing may appear, such as sky; None: none.
         """
         view = rendering.to(torch.device("cpu")).detach()
         is_hole = view.alpha < threshold
         surface_depth = torch.where(is_hole, 0, view.depth).float()
+        if keep_empty is not None:
+            # Empty space is like a surface at infinity: everything would hide it. Pixels near other
+            # pixels are left out, lest the filter below takes this depth into surfaces.
+            outside = maximum_filter(~keep_empty.cpu(), 2 * WINDOW_RADIUS_PX)
+            surface_depth = torch.where(outside, surface_depth, torch.inf)
 
         # A Gaussian reaches some pixels around its centre, and may hide a surface at any of them.
         # So each pixel keeps the greatest depth within a window around it.
@@ -134,6 +148,8 @@ def unoccluding_scales(
         )
 
     parallel_for_chunks(search, len(rays))
+    if any(bool(guard.depth.isinf().any()) for guard in guards):
+        scales[scales > MAX_SCALE_BEFORE_EMPTINESS] = 0
     return torch.from_numpy(scales).to(gaussians.means)
 
 

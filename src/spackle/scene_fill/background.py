@@ -1,0 +1,311 @@
+"""Which empty pixels of a view are background, such as sky, and which are holes to be filled.
+
+The rule: where at least half of the cameras see no emptiness, or one camera sees the whole scene
+without any (a photo's own camera), nothing is background. Elsewhere, emptiness that is open to the
+picture's border is background. Emptiness that surfaces enclose is a hole, unless the other cameras
+look through the space behind it and see that nothing is there, as behind a cup's handle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spackle.core.camera import Camera
+from spackle.core.filters import maximum_filter, nearest_known_pixels
+from spackle.core.gaussians import Gaussians
+from spackle.render.protocol import Rendering
+from spackle.residual.features import hole_mask
+from spackle.runtime.kernels import kernel
+
+# A view with a smaller fraction of empty pixels sees no emptiness: a photo's own view has some at
+# its edges between surfaces.
+CLOSED_VIEW_RATIO = 0.01
+# A camera that has this share of all Gaussians in its frame is that of the photo of the scene.
+WHOLE_SCENE_SHARE = 0.98
+FRAME_MARGIN = 0.05  # as a fraction of the frame's sides: bases reach a little beyond the photo
+# Emptiness flows in from the picture's border through gaps that are wider than twice this fraction
+# of the picture's width. A slit that a moved camera has uncovered is narrower.
+GAP_WIDTHS = 0.02
+WITNESSES = 8  # other cameras that are asked what lies behind enclosed emptiness
+WITNESS_SIDE_PX = 160  # long side of the pictures in which they are asked
+RAYS_A_REGION = 16  # of an enclosed region; about so many of its pixels are asked for
+# Points along each of these rays, evenly in log depth, from this part of the nearest surface's
+# depth to this multiple of the farthest one's.
+RAY_DEPTHS = 48
+NEAREST_RATIO = 0.5
+FARTHEST_RATIO = 4.0
+SURFACE_TOLERANCE = 0.03  # a point is behind a surface if it is so much, relatively, farther away
+# A point is hidden if at least this share of the cameras that know of it say so; those that are
+# unsure count half.
+HIDDEN_SHARE = 0.9
+UNSURE_WEIGHT = 0.5
+BEHIND_RIM_RATIO = 1.05  # points so much farther away than the rim are behind it
+MIN_WITNESSES = 2  # fewer say nothing of a point, if there are as many
+
+
+@dataclasses.dataclass(frozen=True)
+class Witness:
+    """What a camera knows of the scene, in a small picture."""
+
+    camera: Camera  # of the small picture, float64
+    depth: Tensor  # [h, w] z of opaque pixels, 0 elsewhere
+    is_open: Tensor  # [h, w] bool: emptiness that is open to the picture's border
+
+    @staticmethod
+    def of(camera: Camera, depth: Tensor, is_open: Tensor) -> Witness:
+        """Every n-th pixel of a view.
+
+        Args:
+            camera: of the view.
+            depth: [H, W] z of opaque pixels, 0 elsewhere.
+            is_open: [H, W] bool: emptiness that is open to the picture's border.
+        """
+        step = max(1, math.ceil(max(camera.width, camera.height) / WITNESS_SIDE_PX))
+        every = slice(step // 2, None, step)  # the middle of each block of step×step pixels
+        small_depth = depth[every, every].double()
+        height, width = small_depth.shape
+        blocks = camera.to("cpu", torch.float64).cropped(0, 0, width * step, height * step)
+        return Witness(blocks.resized(width, height), small_depth, is_open[every, every])
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewEmptiness:
+    """Where a view of a scene is empty, and what surrounds the empty pixels."""
+
+    camera: Camera
+    is_empty: Tensor  # [H, W] bool: opacity below the threshold of holes
+    is_open: Tensor  # [H, W] bool: emptiness that is open to the picture's border
+    rim_depth: Tensor  # [n] z of the surface nearest in the picture to each enclosed empty pixel
+    witness: Witness
+
+    @staticmethod
+    def of(rendering: Rendering, camera: Camera) -> ViewEmptiness:
+        """The emptiness of a rendered view [H, W], on the CPU."""
+        rendering = rendering.to(torch.device("cpu")).detach()
+        is_empty = hole_mask(rendering.alpha)
+        is_open = _open_to_border(is_empty)
+        depth = torch.where(is_empty, 0, rendering.depth)
+
+        # Of the nearest surface pixel; negative if there is no surface in the view.
+        nearest = torch.from_numpy(nearest_known_pixels(is_empty.numpy())).long()
+        row, column = nearest[:, is_empty & ~is_open].clamp_min(0)
+        rim_depth = depth[row, column].double()
+        return ViewEmptiness(
+            camera, is_empty, is_open, rim_depth, Witness.of(camera, depth, is_open)
+        )
+
+    @property
+    def empty_ratio(self) -> float:
+        """The fraction of pixels that are empty, 0..1."""
+        return float(self.is_empty.float().mean())
+
+
+def find_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> list[Tensor]:
+    """For each view [H, W] bool: the empty pixels that are background, and are to stay empty.
+
+    Args:
+        gaussians: the scene.
+        views: the scene as its cameras see it.
+    """
+    if has_no_background(gaussians, views):
+        return [torch.zeros_like(view.is_empty) for view in views]
+    witnesses = [view.witness for view in views]
+    depths = _ray_depths(witnesses)
+    return [
+        view.is_open | _seen_past(view, _spread_witnesses(witnesses, index), depths)
+        for index, view in enumerate(views)
+    ]
+
+
+def has_no_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> bool:
+    """Whether all emptiness is a hole: half of the views have none, or one shows the whole scene
+    without any.
+    """
+    closed_views = [view for view in views if view.empty_ratio <= CLOSED_VIEW_RATIO]
+    if 2 * len(closed_views) >= len(views):
+        return True
+    return any(
+        _share_in_frame(gaussians, view.camera) >= WHOLE_SCENE_SHARE for view in closed_views
+    )
+
+
+def _share_in_frame(gaussians: Gaussians, camera: Camera) -> float:
+    """The share of Gaussians whose centres a camera has in its frame, 0..1."""
+    uv, z = camera.project(gaussians.means.detach())  # [N, 2], [N]
+    size = uv.new_tensor([camera.width, camera.height])
+    is_inside = (uv >= -FRAME_MARGIN * size) & (uv <= (1 + FRAME_MARGIN) * size)  # [N, 2]
+    return float((is_inside.all(-1) & (z > 0)).float().mean())
+
+
+def _open_to_border(empty: Tensor) -> Tensor:
+    """[H, W] bool: the empty pixels that a wide gap connects with the picture's border.
+
+    `empty` [H, W] bool are the pixels without a surface.
+    """
+    # Only what is far enough from all surfaces lets emptiness pass. At its end, it spreads as far
+    # again, to the surfaces around.
+    radius = max(1, round(GAP_WIDTHS * empty.shape[1]))
+    passable = ~maximum_filter(~empty, radius)
+    regions = torch.from_numpy(_label_regions(passable.numpy()))
+    at_border = torch.cat([regions[0], regions[-1], regions[:, 0], regions[:, -1]])
+    is_open = torch.isin(regions, at_border[at_border > 0])
+    return maximum_filter(is_open, radius) & empty
+
+
+def _spread_witnesses(witnesses: Sequence[Witness], index: int) -> list[Witness]:
+    """Up to 8 other witnesses than the one at `index`, whose eyes are far from one another."""
+    others = [witness for place, witness in enumerate(witnesses) if place != index]
+    if len(others) <= WITNESSES:
+        return others
+    eyes = torch.stack([witness.camera.position for witness in others])
+    distances = (eyes - witnesses[index].camera.position).norm(dim=1)
+    chosen = []
+    for _ in range(WITNESSES):
+        farthest = int(distances.argmax())
+        chosen.append(others[farthest])
+        distances = torch.minimum(distances, (eyes - eyes[farthest]).norm(dim=1))
+    return chosen
+
+
+def _ray_depths(witnesses: Sequence[Witness]) -> Tensor:
+    """[D] float64: depths along a ray, from before the nearest surface to behind the farthest."""
+    depths = np.concatenate([view.depth[view.depth > 0].numpy() for view in witnesses])
+    if not len(depths):
+        return torch.ones(1, dtype=torch.float64)
+    # Quantiles, because of stray Gaussians.
+    near, far = np.quantile(depths, [0.01, 0.99])
+    first = NEAREST_RATIO * float(near)
+    last = FARTHEST_RATIO * float(far)
+    parts = torch.linspace(0, 1, RAY_DEPTHS, dtype=torch.float64)
+    return first * (last / first) ** parts
+
+
+def _seen_past(view: ViewEmptiness, witnesses: Sequence[Witness], depths: Tensor) -> Tensor:
+    """[H, W] bool: the regions of enclosed emptiness behind which other cameras see nothing.
+
+    Args:
+        view: the view.
+        witnesses: the other cameras.
+        depths: [D] of the points that are asked for along a ray.
+    """
+    enclosed = view.is_empty & ~view.is_open
+    regions = torch.from_numpy(_label_regions(enclosed.numpy())).flatten().long()  # [H·W]
+    pixels = regions.nonzero()[:, 0]
+    if not len(pixels) or not witnesses:
+        return torch.zeros_like(enclosed)
+
+    # About 16 pixels of each region, evenly among its pixels in the order of its label.
+    pixels = pixels[regions[pixels].argsort(stable=True)]
+    sizes = regions.bincount()
+    first_places = sizes[1:].cumsum(0) - sizes[1:]  # of the regions 1, 2, … in `pixels`
+    labels = regions[pixels]
+    ranks = torch.arange(len(pixels)) - first_places[labels - 1]
+    strides = (sizes[labels] / RAYS_A_REGION).ceil().long()
+    is_asked = (ranks + strides // 2) % strides == 0
+    asked = pixels[is_asked]
+
+    camera = view.camera.to("cpu", torch.float64)
+    uv = camera.pixel_centers().flatten(0, 1)[asked].double()
+    rim_depth = torch.zeros(enclosed.shape, dtype=torch.float64)
+    rim_depth[enclosed] = view.rim_depth
+    is_past = _rays_are_clear(camera, uv, rim_depth.flatten()[asked], witnesses, depths)
+    asked_labels = regions[asked]
+    past_counts = asked_labels[is_past].bincount(minlength=len(sizes))
+    asked_counts = asked_labels.bincount(minlength=len(sizes))
+    region_is_past = 2 * past_counts > asked_counts
+    region_is_past[0] = False  # the label of all other pixels
+    return region_is_past[regions].reshape(enclosed.shape)
+
+
+def _rays_are_clear(
+    camera: Camera, uv: Tensor, rim_depth: Tensor, witnesses: Sequence[Witness], depths: Tensor
+) -> Tensor:
+    """[n] bool: rays that, behind the rim of their region, pass no point that most witnesses call
+    hidden, but some that they call clear.
+
+    A witness calls a point hidden if it lies behind a surface; clear if it lies before one, or
+    before emptiness that is open to the border. It is unsure of a point before other emptiness,
+    which may be a hole, and says nothing of a point outside of its frame.
+
+    Args:
+        camera: of the view, float64.
+        uv: [n, 2] its pixels.
+        rim_depth: [n] z of the surface around each of them.
+        witnesses: the other cameras.
+        depths: [D] z of the points along each ray.
+    """
+    z_of_points = depths[:, None].expand(-1, len(uv))
+    points = camera.unproject(uv.expand(*z_of_points.shape, 2), z_of_points)  # [D, n, 3]
+    hidden_count = torch.zeros(z_of_points.shape)
+    clear_count = torch.zeros(z_of_points.shape)
+    unsure_count = torch.zeros(z_of_points.shape)
+    for witness in witnesses:
+        place, z = witness.camera.project(points)
+        height, width = witness.depth.shape
+        column = place[..., 0].floor()
+        row = place[..., 1].floor()
+        is_inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column = torch.where(is_inside, column, 0).long()
+        row = torch.where(is_inside, row, 0).long()
+
+        surface_depth = witness.depth[row, column]
+        shows_surface = is_inside & (surface_depth > 0)
+        is_open = is_inside & witness.is_open[row, column]
+        hidden_count += shows_surface & (z > surface_depth * (1 + SURFACE_TOLERANCE))
+        clear_count += shows_surface & (z < surface_depth * (1 - SURFACE_TOLERANCE))
+        clear_count += is_open
+        unsure_count += is_inside & ~shows_surface & ~is_open
+
+    known_count = hidden_count + clear_count
+    is_known = known_count >= min(MIN_WITNESSES, len(witnesses))
+    hidden_share = hidden_count / (known_count + UNSURE_WEIGHT * unsure_count)  # NaN if 0 / 0
+    is_hidden = is_known & (hidden_share >= HIDDEN_SHARE)
+
+    # Before the rim there is nothing, as the view itself shows.
+    is_behind_rim = z_of_points > BEHIND_RIM_RATIO * rim_depth
+    passes_hidden = (is_hidden & is_behind_rim).any(0)
+    passes_clear = (is_known & ~is_hidden & is_behind_rim).any(0)
+    return passes_clear & ~passes_hidden
+
+
+@kernel
+def _label_regions(mask: Any) -> Any:
+    """[H, W] int32: the number, from 1 on, of each true pixel's region in a mask; 0 elsewhere.
+
+    A region's pixels are connected above, below, left and right. `mask` is [H, W] bool.
+    """
+    height, width = mask.shape
+    labels = np.zeros((height, width), np.int32)
+    stack = np.empty((height * width, 2), np.int32)  # pixels whose neighbours are still to visit
+    region = 0
+    for first_row in range(height):
+        for first_column in range(width):
+            if not mask[first_row, first_column] or labels[first_row, first_column] != 0:
+                continue
+            region += 1
+            labels[first_row, first_column] = region
+            stack[0, 0] = first_row
+            stack[0, 1] = first_column
+            count = 1
+            while count > 0:
+                count -= 1
+                y = stack[count, 0]
+                x = stack[count, 1]
+                for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                    row = y + dy
+                    column = x + dx
+                    if row < 0 or column < 0 or row >= height or column >= width:
+                        continue
+                    if mask[row, column] and labels[row, column] == 0:
+                        labels[row, column] = region
+                        stack[count, 0] = row
+                        stack[count, 1] = column
+                        count += 1
+    return labels
