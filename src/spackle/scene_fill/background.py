@@ -33,6 +33,9 @@ FRAME_MARGIN = 0.05  # as a fraction of the frame's sides: bases reach a little 
 # Emptiness flows in from the picture's border through gaps that are wider than twice this fraction
 # of the picture's width. A slit that a moved camera has uncovered is narrower.
 GAP_WIDTHS = 0.02
+# Smaller enclosed regions are specks at the edges of surfaces, which nobody sees. Filling them
+# would leave others, so that a second fill of the same views would add more.
+MIN_HOLE_PX = 8
 WITNESSES = 8  # other cameras that are asked what lies behind enclosed emptiness
 WITNESS_SIDE_PX = 160  # long side of the pictures in which they are asked
 RAYS_A_REGION = 16  # of an enclosed region; about so many of its pixels are asked for
@@ -47,7 +50,7 @@ SURFACE_TOLERANCE = 0.03  # a point is behind a surface if it is so much, relati
 HIDDEN_SHARE = 0.9
 UNSURE_WEIGHT = 0.5
 BEHIND_RIM_RATIO = 1.05  # points so much farther away than the rim are behind it
-MIN_WITNESSES = 2  # fewer say nothing of a point, if there are as many
+MIN_WITNESSES = 2  # if fewer know of a point, nothing is known; a single other camera is enough
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,7 +191,8 @@ def _ray_depths(witnesses: Sequence[Witness]) -> Tensor:
 
 
 def _seen_past(view: ViewEmptiness, witnesses: Sequence[Witness], depths: Tensor) -> Tensor:
-    """[H, W] bool: the regions of enclosed emptiness behind which other cameras see nothing.
+    """[H, W] bool: the regions of enclosed emptiness behind which other cameras see nothing, and
+    specks.
 
     Args:
         view: the view.
@@ -198,7 +202,7 @@ def _seen_past(view: ViewEmptiness, witnesses: Sequence[Witness], depths: Tensor
     enclosed = view.is_empty & ~view.is_open
     regions = torch.from_numpy(_label_regions(enclosed.numpy())).flatten().long()  # [H·W]
     pixels = regions.nonzero()[:, 0]
-    if not len(pixels) or not witnesses:
+    if not len(pixels):
         return torch.zeros_like(enclosed)
 
     # About 16 pixels of each region, evenly among its pixels in the order of its label.
@@ -219,7 +223,7 @@ def _seen_past(view: ViewEmptiness, witnesses: Sequence[Witness], depths: Tensor
     asked_labels = regions[asked]
     past_counts = asked_labels[is_past].bincount(minlength=len(sizes))
     asked_counts = asked_labels.bincount(minlength=len(sizes))
-    region_is_past = 2 * past_counts > asked_counts
+    region_is_past = (2 * past_counts > asked_counts) | (sizes < MIN_HOLE_PX)
     region_is_past[0] = False  # the label of all other pixels
     return region_is_past[regions].reshape(enclosed.shape)
 
@@ -264,7 +268,7 @@ def _rays_are_clear(
         unsure_count += is_inside & ~shows_surface & ~is_open
 
     known_count = hidden_count + clear_count
-    is_known = known_count >= min(MIN_WITNESSES, len(witnesses))
+    is_known = known_count >= max(1, min(MIN_WITNESSES, len(witnesses)))
     hidden_share = hidden_count / (known_count + UNSURE_WEIGHT * unsure_count)  # NaN if 0 / 0
     is_hidden = is_known & (hidden_share >= HIDDEN_SHARE)
 

@@ -36,9 +36,6 @@ PIT_RADIUS_WIDTHS = 0.027
 # the 3×4 extrinsics row by row.
 X_ROW = 4
 Y_ROW = 8
-# Before emptiness that is kept, a Gaussian that would have to move farther than this, as a multiple
-# of its distance, is left out: it would be no continuation of a surface, but a speck elsewhere.
-MAX_SCALE_BEFORE_EMPTINESS = 4.0
 DEPTH_STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
 
 
@@ -148,8 +145,6 @@ def unoccluding_scales(
         )
 
     parallel_for_chunks(search, len(rays))
-    if any(bool(guard.depth.isinf().any()) for guard in guards):
-        scales[scales > MAX_SCALE_BEFORE_EMPTINESS] = 0
     return torch.from_numpy(scales).to(gaussians.means)
 
 
