@@ -176,6 +176,7 @@ def complete_posed(
             filled = fill(
                 union.gaussians,
                 views,
+                background="fill",  # photos show a sky, too, so that what is empty is a hole
                 network=pipeline.network,
                 texture=pipeline.options.fill.texture,
                 renderer=pipeline.renderer,

@@ -58,7 +58,13 @@ def fill_views(
     """
     loaded = load_scene(source)
     with reporter.stage("fill-seen") as progress:
-        filled = fill(loaded.gaussians, cameras, renderer=renderer, progress=progress)
+        filled = fill(
+            loaded.gaussians,
+            cameras,
+            photo_camera=loaded.camera,
+            renderer=renderer,
+            progress=progress,
+        )
     added = filled.select(slice(len(loaded.gaussians), None))
     write_atomic(target, _with_more(source, added))
 
@@ -112,7 +118,12 @@ def remove_and_patch(
     before = _hole_ratio(rest.gaussians, camera, renderer)
     with reporter.stage("patch") as progress:
         patched = fill(
-            rest.gaussians, cameras, renderer=renderer, progress=progress, fillable=fillable
+            rest.gaussians,
+            cameras,
+            photo_camera=camera,
+            renderer=renderer,
+            progress=progress,
+            fillable=fillable,
         )
     added = patched.select(slice(len(rest.gaussians), None))
     write_atomic(target, _with_more(removed_file, added))
