@@ -706,6 +706,7 @@ def remove(
         renderer=renderer,
         progress=progress,
         fillable=uncovered_pixels(gaussians, edited, cameras, renderer),
+        photo_camera=cameras[0],
     )
     return Removal(is_kept=is_kept, edited=edited, patched=patched)
 
