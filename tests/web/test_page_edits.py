@@ -26,7 +26,7 @@ from spackle.web.guard import MAX_UPLOAD_BYTES
 from spackle.web.work import SceneWork
 
 CPU = CpuRenderer()
-WIDE = {"viewport": {"width": 1440, "height": 900}}
+WINDOW = {"viewport": {"width": 800, "height": 520}}
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 
 
@@ -84,7 +84,7 @@ def test_what_a_person_sees_is_filled_and_undone(
 ) -> None:
     box = box_before_wall(width=64, height=48, focal=53)
     save_ply(box.base(), tmp_path / "box.ply", camera=box.camera)
-    with scene_on_page(browser, server, tmp_path / "box.ply", WIDE) as found:
+    with scene_on_page(browser, server, tmp_path / "box.ply", WINDOW) as found:
         page = found.page
         first: str = page.evaluate("spackle.id")
         # The camera that the server gets is the one of the picture.
@@ -136,7 +136,7 @@ def paint(page: Any, radius: float) -> None:
     page.mouse.up()
 
 
-@pytest.mark.parametrize("screen", [WIDE, PHONE], ids=["wide", "phone"])
+@pytest.mark.parametrize("screen", [WINDOW, PHONE], ids=["window", "phone"])
 def test_a_painted_thing_is_taken_out_and_put_back(
     browser: Any, server: Served, tmp_path: Path, screen: Any
 ) -> None:
@@ -206,7 +206,7 @@ def test_work_can_be_stopped_and_nothing_changes(
     browser: Any, server: Served, tmp_path: Path
 ) -> None:
     _, file = ball_and_wall(tmp_path)
-    with scene_on_page(browser, server, file, WIDE) as found:
+    with scene_on_page(browser, server, file, WINDOW) as found:
         page = found.page
         first = page.evaluate("spackle.id")
         page.locator("#fill").click()

@@ -141,6 +141,7 @@ export class Edits {
       this.viewer.setLayers("both");
     }
     document.body.classList.toggle("painting", on);
+    element("view").inert = on; // the strokes belong to this view
     if (on) this.brush.start();
     else this.brush.stop();
     element(on ? "brush-size" : "view").focus({ preventScroll: true });
