@@ -210,7 +210,7 @@ def test_work_can_be_stopped_and_nothing_changes(browser: Any, tmp_path: Path) -
         first = page.evaluate("spackle.id")
         page.locator("#fill").click()
         page.get_by_role("heading", name="Filling the holes that you have seen").wait_for()
-        assert page.locator("#notice progress").get_attribute("value") == "0.25"
+        page.locator("#notice progress[value='0.25']").wait_for()
         assert not page.locator("#remove").is_enabled()
         page.locator("#stop").click()
         page.get_by_text("Stopped. Nothing has changed.").wait_for()

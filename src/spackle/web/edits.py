@@ -21,10 +21,9 @@ from spackle.formats.ply import encode_ply
 from spackle.formats.ply_append import append_to_ply
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import load_scene
-from spackle.pipeline import fill
+from spackle.pipeline import Removal, fill, remove
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio
-from spackle.residual.features import hole_mask
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Reporter
@@ -106,29 +105,17 @@ def remove_and_patch(
         raise InputError("nothing stands there: paint over the whole thing that is to go")
     if removed_count == len(marked):
         raise InputError("nothing would be left: paint over the thing alone")
-    rest = _without(loaded, marked)
+    cameras = [camera, *_views_around(loaded)]
+    with reporter.stage("patch") as progress:
+        removal = remove(loaded.gaussians, marked, cameras, renderer=renderer, progress=progress)
+    rest = _kept(loaded, removal)
     removed_file = target.with_name(REMOVED_FILE)
     write_atomic(removed_file, encode_ply(rest))
-
-    # Only what the thing covered is filled: a sky, or what was open before, stays as it was.
-    cameras = [camera, *_views_around(loaded)]
-    with torch.no_grad():
-        alphas = [renderer.render(loaded.gaussians, view).alpha for view in cameras]
-    fillable = [~hole_mask(alpha).cpu() for alpha in alphas]
-    before = _hole_ratio(rest.gaussians, camera, renderer)
-    with reporter.stage("patch") as progress:
-        patched = fill(
-            rest.gaussians,
-            cameras,
-            photo_camera=camera,
-            renderer=renderer,
-            progress=progress,
-            fillable=fillable,
-        )
-    added = patched.select(slice(len(rest.gaussians), None))
+    added = removal.patched.select(slice(len(rest.gaussians), None))
     write_atomic(target, _with_more(removed_file, added))
 
-    after = _hole_ratio(patched, camera, renderer)
+    before = _hole_ratio(rest.gaussians, camera, renderer)
+    after = _hole_ratio(removal.patched, camera, renderer)
     reporter.log(
         f"{loaded.path.name}: {removed_count:,} Gaussians removed, {len(added):,} added, "
         f"holes of the present view {before:.1%} -> {after:.2%}"
@@ -175,16 +162,16 @@ def _with_more(source: Path, added: Gaussians) -> bytes:
     return content
 
 
-def _without(scene: SceneFile, marked: Tensor) -> SceneFile:
-    """A scene without the Gaussians that are marked [N]."""
-    kept = ~marked
-    base_count = len(marked) if scene.base_count is None else scene.base_count
-    # dataclasses.replace would keep the file's byte count, which nobody asks for here.
+def _kept(scene: SceneFile, removal: Removal) -> SceneFile:
+    """A scene as a removal has left it, before the patch."""
+    is_kept = removal.is_kept
+    base_count = len(is_kept) if scene.base_count is None else scene.base_count
+    # `dataclasses.replace` would keep what belongs to the file alone, such as its size in bytes.
     return SceneFile(
         path=scene.path,
-        gaussians=scene.gaussians.select(kept),
+        gaussians=removal.edited,
         camera=scene.camera,
-        base_count=int(kept[:base_count].sum()),
+        base_count=int(is_kept[:base_count].sum()),
         disparity=scene.disparity,
         is_metric=scene.is_metric,
     )
