@@ -6,6 +6,7 @@ COLMAP notes which photo sees which point. nerfstudio names a PLY file of points
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -27,9 +28,9 @@ from spackle.formats.ply_tables import PlyTables
 from spackle.runtime.errors import InputError, as_input_error
 
 # Without notes of who sees a point, one that a nearer point hides is left out: of the points in a
-# square of this share of the picture's long side, those behind the nearest by more than a tenth.
-HIDING_SQUARE = 1 / 48
+# square of the picture, those behind the nearest by more than a tenth.
 HIDDEN_RATIO = 1.1
+POINTS_PER_SQUARE = 6  # on average; squares of fewer points tell little of what hides what
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +119,7 @@ def _unhidden(xyz: Tensor, camera: Camera) -> SeenPoints:
         return SeenPoints(uv.float(), z.float())
 
     # The nearest depth in each square of the picture hides what is much farther.
-    side = HIDING_SQUARE * max(camera.width, camera.height)
+    side = math.sqrt(camera.width * camera.height * POINTS_PER_SQUARE / len(z))
     column, row = (uv / side).floor().long().unbind(1)
     squares_across = int(camera.width / side) + 1
     square = row * squares_across + column

@@ -21,6 +21,9 @@ from spackle.runtime.files import check_file
 from spackle.video.frames import SAME_ASPECT_TOLERANCE
 
 MIN_PHOTOS = 2
+# A phone's capture has hundreds of frames, most of which show the same; each photo becomes some
+# 100,000 Gaussians, and is compared with every other one.
+MAX_PHOTOS = 100
 # Where photos lie within a folder or beside its model, in the order in which they are looked for.
 PHOTO_FOLDERS = ("", "images", "images_2", "images_4", "images_8", "rgb", "rgbd", "rgb_images")
 CAMERA_FOLDERS = ("", "keyframes/corrected_cameras", "keyframes/cameras", "cameras")  # Polycam's
@@ -114,9 +117,13 @@ def read_capture(folder: Path) -> Capture:
         else:
             photos.append(PosedFile(path, name, camera, _depth_beside(folder, path)))
 
-    notes = cameras.lines
+    # A model's folder is called "0"; with the folders above it, the name says something.
+    source_name = cameras.source.relative_to(folder).as_posix()
+    if cameras.source == folder:
+        source_name = folder.name
+    notes = [f"{source_name}: {note}" for note in cameras.notes]
     if missing:
-        notes.append(f"{cameras.source.name}: {_named(missing)} without a photo: left out")
+        notes.append(f"{source_name}: {_named(missing)} without a photo: left out")
     used = {photo.path for photo in photos}
     unused = [file.name for file in files if file not in used]
     if unused:
@@ -124,8 +131,13 @@ def read_capture(folder: Path) -> Capture:
     if len(photos) < MIN_PHOTOS:
         found = "one photo" if photos else "no photo"
         raise InputError(
-            f"{folder}: {found} with a camera in {cameras.source.name}: several are needed; "
+            f"{folder}: {found} with a camera in {source_name}: several are needed; "
             "one photo alone needs no cameras: `spackle predict PHOTO`"
+        )
+    if len(photos) > MAX_PHOTOS:
+        raise InputError(
+            f"{folder}: {len(photos)} photos with cameras, of which each becomes Gaussians: "
+            f"delete all but {MAX_PHOTOS} that show the scene from places far apart"
         )
     _refuse_doubles(photos, cameras.source)
     return Capture(

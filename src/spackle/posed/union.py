@@ -17,10 +17,10 @@ from spackle.residual.features import hole_mask
 # A photo's depth counts where its own Gaussians cover at least this much of the pixel.
 MIN_ALPHA = 0.5
 # Two depths are of one surface if they differ by less than this many errors of both photos.
-SAME_SURFACE_ERRORS = 2.0
+SAME_SURFACE_ERRORS = 3.0
 # Bounds of this relative difference: below it are roundings, above it are other things.
 MIN_TOLERANCE = 0.02
-MAX_TOLERANCE = 0.06
+MAX_TOLERANCE = 0.1
 # Where a Gaussian may be on its ray, as shares of the tolerance.
 PIECE_STEPS = (0.0, -0.5, 0.5, -1.0, 1.0)  # the likeliest place first
 # A photo of a later rank must see a surface this much more finely to replace one of an earlier
