@@ -12,15 +12,19 @@ from spackle.core.camera import Camera
 from spackle.posed.correction import KnownDepths
 
 WORKING_WIDTH_PX = 480  # photos are matched at this width: finer pixels tell little more depth
-CELL_PX = 10  # the most distinct patch of each cell is matched
+CELL_PX = 14  # the most distinct patch of each cell is matched
 PATCH_RADIUS_PX = 4  # patches of 9×9 pixels
-NEIGHBOURS = 3  # photos that are searched for the patch, the nearest ones
-STEPS = 96  # inverse depths that are tried
+NEIGHBOURS = 3  # photos that are searched for the patch
+# They are the nearest ones, but not much nearer than the last of these candidates: from almost the
+# same place, every depth looks alike.
+CANDIDATES = 6
+MIN_DISTANCE_RATIO = 0.25
+STEPS = 64  # inverse depths that are tried
 MAX_SHIFT = 0.35  # of the picture's width: the nearest thing moves by at most this to a neighbour
 MIN_CONTRAST = 0.02  # standard deviation of a patch's grey; less shows nothing to match
 MIN_SIMILARITY = 0.85  # normalised cross-correlation of the best match
 MIN_LEAD = 0.05  # by which the best match must be better than any match elsewhere
-ELSEWHERE_STEPS = 4  # steps away that count as elsewhere
+ELSEWHERE_STEPS = 3  # steps away that count as elsewhere
 
 
 def match_depths(
@@ -60,7 +64,7 @@ def match_depths(
 
 
 def _nearest(cameras: Sequence[Camera], index: int) -> list[int]:
-    """The nearest other cameras that stand elsewhere and look into about the same direction."""
+    """Some near cameras that stand elsewhere and look into about the same direction."""
     own = cameras[index]
     candidates = []
     for other, camera in enumerate(cameras):
@@ -68,7 +72,11 @@ def _nearest(cameras: Sequence[Camera], index: int) -> list[int]:
         agreement = float(camera.world_to_camera[2, :3] @ own.world_to_camera[2, :3])
         if other != index and distance > 0 and agreement > 0.5:  # up to 60 degrees apart
             candidates.append((distance, other))
-    return [other for _, other in sorted(candidates)[:NEIGHBOURS]]
+    nearest = sorted(candidates)[:CANDIDATES]
+    if not nearest:
+        return []
+    least = MIN_DISTANCE_RATIO * nearest[-1][0]
+    return [other for distance, other in nearest if distance >= least][:NEIGHBOURS]
 
 
 def _at_working_size(rgb: Tensor, camera: Camera) -> tuple[Tensor, Camera]:
