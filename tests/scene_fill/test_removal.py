@@ -115,6 +115,21 @@ def test_a_mask_on_a_wall_marks_that_part_of_the_wall() -> None:
     assert not bool(marked[made.is_thing].any())
 
 
+def test_what_a_fill_made_up_behind_the_thing_goes_with_it() -> None:
+    made = ROOMS["a sphere in front of a wall"]()
+    mask = shows(made, made.camera)
+    uv, _ = made.camera.project(made.background.means)
+    column, row = uv[:, 0].long().clamp(0, 159), uv[:, 1].long().clamp(0, 119)
+    is_invented = torch.zeros(len(made.scene), dtype=torch.bool)
+    is_invented[: len(made.background)] = mask[row, column]
+    mark = (made.camera, mask)
+    marked = marked_gaussians(made.scene, [mark], CPU, is_invented=is_invented)
+    inside = (uv >= 0).all(-1) & (uv[:, 0] < 160) & (uv[:, 1] < 120)
+    assert overlap(marked, made.is_thing | is_invented & torch.nn.functional.pad(
+        inside, (0, len(made.thing))
+    )) > 0.99  # fmt: skip
+
+
 def test_a_mask_of_another_size_than_its_camera_is_refused() -> None:
     made = ROOMS["a sphere near a wall"]()
     with pytest.raises(ValueError, match="a mask of 10×8 pixels for a camera of 160×120"):

@@ -60,14 +60,42 @@ def fill(
             "is filled."
         ),
     ] = "keep",
+    remove: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="MASK",
+            help="Take a thing out, and fill what it hid: a picture in which it is painted white. "
+            "May be given several times, each with its --camera.",
+        ),
+    ] = None,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CAMERA",
+            help="The camera of --cameras in whose view the mask is: a picture's name or a number "
+            "from 0.",
+            show_default="the scene's own camera",
+        ),
+    ] = None,
+    box: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X0,Y0,Z0,X1,Y1,Z1",
+            help="Take out what is in this box, in the scene's world, and fill what it hid.",
+        ),
+    ] = None,
     device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Fill a scene of any program where cameras see holes; its own Gaussians do not change."""
+    """Fill a scene of any program where cameras see holes, or where a thing is taken out.
+
+    The scene's own Gaussians do not change.
+    """
     # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.results.fill_views import FillViewsOptions
     from spackle.results.filled_scene import fill_saved_scene
+    from spackle.results.removed_scene import RemovalOptions, remove_from_saved_scene
 
     views = FillViewsOptions(
         cameras=cameras,
@@ -76,11 +104,17 @@ def fill(
         disparity=disparity,
         up=up,
     )
+    reporter = CommandReporter(as_json=as_json)
+    removal = RemovalOptions(remove=tuple(remove or ()), camera=tuple(camera or ()), box=box)
+    if removal.is_given:
+        removal.check(background)
+        remove_from_saved_scene(scene, output, removal, views, reporter, device=device)
+        return
     fill_saved_scene(
         scene,
         output,
         views,
-        CommandReporter(as_json=as_json),
+        reporter,
         background=background,
         device=device,
     )

@@ -206,6 +206,8 @@ class PlyFile:
         """
         self.path = path
         self._tables = PlyTables(path)
+        # [rows] which rows of the file `gaussians` has returned; None: all, or none read yet.
+        self.finite_rows: NDArray[np.bool_] | None = None
 
     def scene(self) -> SceneFile:
         """Read the Gaussians, and what the file says about the scene's camera and completion.
@@ -322,6 +324,7 @@ class PlyFile:
         if broken_count > MAX_BROKEN_RATIO * count or self.base_count() is not None:
             problem = f"{broken_count} of {count} Gaussians are not finite"
             raise InputError(f"{self.path}: {problem}: export it again")
+        self.finite_rows = is_finite
         return gaussians.select(torch.from_numpy(is_finite))
 
     def camera(self) -> Camera | None:

@@ -124,6 +124,18 @@ def choose_fill_views(scene: SceneFile, options: FillViewsOptions) -> FillViews:
     return dataclasses.replace(path, notes=[*given.notes, *path.notes])
 
 
+def named_camera(scene: SceneFile, cameras_file: Path, name: str) -> Camera:
+    """A camera of a file, by its picture's name or its number, in the world of a scene's file.
+
+    InputError if the file cannot be read, or has no such camera.
+    """
+    camera_set = read_camera_set(cameras_file)
+    index = _index_of(camera_set, name)
+    given = GivenPath(cameras=camera_set).in_scene(scene, page_name(scene.path))
+    assert given.views is not None  # `cameras` gives them
+    return _in_world_of_file(given.views[index], scene)
+
+
 def _index_of(cameras: CameraSet, name: str) -> int:
     """The index of a camera in its file, by the name of its picture or by a number from 0.
 

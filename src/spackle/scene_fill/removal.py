@@ -37,9 +37,12 @@ MAX_FOOT_RATIO = 0.04  # of the picture's diagonal: as far as a foot is looked f
 # A Gaussian whose share of all pixels together is smaller does not show; only its place counts.
 MIN_VISIBLE_PX = 0.1
 MIN_SHARE = 0.5  # of what shows of a Gaussian must lie in the thing
-# If less of a mask shows something in front of the background, the mask marks a part of a surface,
-# such as a poster on a wall.
-MIN_THING_SHARE = 0.05
+# People paint over the outline by at most so much, as a fraction of the picture's diagonal. If at
+# least this share of the rest of a mask is in front of the background, depth tells the thing from
+# the background; else, as with a poster on a wall or with depths that were guessed from a photo, it
+# does not, and all that shows in the mask goes.
+ROUGHNESS_RATIO = 0.02
+MIN_THING_SHARE = 0.9
 MAX_EMPTY_SHARE = 0.05  # of a view's pixels; a view with less emptiness has a background
 GREY = 0.5  # colour of all Gaussians while it is measured in which pixels they show
 
@@ -48,18 +51,22 @@ def marked_gaussians(
     gaussians: Gaussians,
     marks: Sequence[tuple[Camera, Tensor]],
     renderer: Renderer | None = None,
+    *,
+    is_invented: Tensor | None = None,
 ) -> Tensor:
     """[N] bool: the Gaussians of the thing that masks mark.
 
-    They are those in front of the surfaces that surround a mask in its picture; if nothing is, such
-    as in the mask of a poster on a wall, those that show in the mask. With several masks, a
-    Gaussian must be marked by each one whose camera could see it.
+    They are those in front of the surfaces that surround a mask in its picture. Where depth does
+    not tell a thing from these surfaces, such as a poster on a wall, they are those that show in
+    the mask. With several masks, a Gaussian must be in each one whose camera has it in its frame.
 
     Args:
         gaussians: N Gaussians.
         marks: cameras in the scene's frame, each with its mask [H, W] bool, true on the thing. A
             mask may be larger than the thing.
         renderer: by default the best of this machine, on its GPU if it has one.
+        is_invented: [N] bool: Gaussians that a fill has added. Those in a mask are marked, also
+            behind the thing, because they were made up while the thing stood there.
 
     Raises:
         ValueError: there are no marks, or a mask has another size than its camera.
@@ -76,8 +83,11 @@ def marked_gaussians(
             shape = f"{mask.shape[1]}×{mask.shape[0]}" if mask.ndim == 2 else str(mask.shape)
             size = f"{camera.width}×{camera.height}"
             raise ValueError(f"a mask of {shape} pixels for a camera of {size}")
-        marked, refused = _votes(gaussians, camera, mask.cpu().bool(), renderer)
+        mask = mask.cpu().bool()
+        marked, refused, is_masked = _votes(gaussians, camera, mask, renderer)
         is_marked |= marked
+        if is_invented is not None:
+            is_marked |= is_invented.cpu() & is_masked
         is_refused |= refused
     return (is_marked & ~is_refused).to(device)
 
@@ -113,8 +123,9 @@ def uncovered_pixels(
 
 def _votes(
     gaussians: Gaussians, camera: Camera, mask: Tensor, renderer: Renderer
-) -> tuple[Tensor, Tensor]:
-    """[N] bool twice: the Gaussians that a mask marks, and those that its camera sees elsewhere.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """[N] bool three times: the Gaussians that a mask marks, those that its camera sees elsewhere,
+    and those with their centres in the mask.
 
     A Gaussian that lies outside of the camera's frame, or in the mask but not in front, is neither.
     """
@@ -128,8 +139,12 @@ def _votes(
     thing, background, margin = _thing_in_picture(rendering, wide_mask)
     fringe = maximum_filter(thing, fringe_px) & wide_mask & ~thing
     fringe |= _foot(thing, rendering, background, margin, 2 * margin) & wide_mask & ~thing
-    if int(thing.sum()) < MIN_THING_SHARE * int(mask.sum()):
+    contact = _foot(thing, rendering, background, margin, CONTACT_RATIO)
+    surface_margin = margin
+    if not _tells_thing(thing | fringe, mask):
         fringe = mask
+        contact = mask
+        surface_margin = CONTACT_RATIO
 
     # Each Gaussian's place in the picture.
     means = gaussians.means.cpu().double()
@@ -156,12 +171,11 @@ def _votes(
     is_visible = shown > MIN_VISIBLE_PX
     mostly_in_thing = shown_in_thing > MIN_SHARE * shown
     # The surface of the background shines through a thing a little, but lies behind its surface.
-    on_surface = z < at_center(rendering.depth) * (1 + margin)
+    on_surface = z < at_center(rendering.depth) * (1 + surface_margin)
     is_own = is_visible & mostly_in_thing & (in_front | on_surface)
     is_inner = ~is_visible & is_masked & in_front
     # Beneath the surface of a thing often lies a second layer of it, which where the thing stands
     # on a floor is no longer in front of the floor. There, the colour tells it from the floor.
-    contact = _foot(thing, rendering, background, margin, CONTACT_RATIO)
     is_contact = is_masked & at_center(contact)
     is_near_floor = z * at_center(background) < 1 + CONTACT_RATIO
     has_color = _has_color_of_thing(gaussians, index, rendering, wide_mask)
@@ -169,7 +183,7 @@ def _votes(
     is_marked = is_own | is_inner | is_layer
 
     is_refused = is_inside & ~is_masked & ~is_marked
-    return is_marked, is_refused
+    return is_marked, is_refused, is_masked
 
 
 def _has_color_of_thing(
@@ -216,6 +230,20 @@ def _thing_in_picture(rendering: Rendering, wide_mask: Tensor) -> tuple[Tensor, 
     in_front = nearness > behind.inverse_depth * (1 + margin)
     thing = wide_mask & in_front & (rendering.alpha > 0)
     return thing, behind.inverse_depth, margin
+
+
+def _tells_thing(thing: Tensor, mask: Tensor) -> bool:
+    """Whether what is in front of the background fills a mask, but for what is roughly painted.
+
+    Args:
+        thing: [H, W] bool: the pixels that show something in front of the background.
+        mask: [H, W] bool.
+    """
+    roughness_px = round(ROUGHNESS_RATIO * math.hypot(*mask.shape))
+    core = mask & ~maximum_filter(~mask, roughness_px)
+    if not bool(core.any()):
+        core = mask
+    return int((thing & core).sum()) >= MIN_THING_SHARE * int(core.sum())
 
 
 def _foot(
