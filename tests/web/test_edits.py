@@ -95,9 +95,10 @@ def test_a_scene_is_filled_where_views_are_open(server: Served, tmp_path: Path) 
     assert "removed.ply" not in server.ask(f"{SCENES}/{child}").json["files"]
     assert server.ask(f"{SCENES}/{child}/files/removed.ply").status == 404
     assert not (server.jobs.folder / child / "source.ply").exists()
-    # An edit of an edit, after its parent was deleted.
+    # An edit of an edit, after its parent was deleted; where nothing is open, nothing is added.
     assert server.ask(f"{SCENES}/{id}", "DELETE").status == 204
     again = edited(server, post(server, child, "fill", {"cameras": [as_json(views[1])]}))
+    assert server.ask(f"{SCENES}/{again}/files/report.json").json["added"] == 0
     assert server.ask(f"{SCENES}/{again}/files/scene.spz").body[:2] == b"\x1f\x8b"
     assert read_ply(scene_file(server, again)).body.startswith(after.body)
 

@@ -14,7 +14,7 @@ import pytest
 from helpers.browser import Opened, opened, pixels, settled
 from helpers.endless_edits import EndlessEdits
 from helpers.photos import read_ply
-from helpers.scenes import box_before_wall, psnr
+from helpers.scenes import box_before_wall, psnr, wall
 from helpers.web_client import Served, served
 from helpers.web_scenes import ball_and_wall, opened_scene, scene_file
 from torch import Tensor
@@ -167,8 +167,8 @@ def test_a_painted_thing_is_taken_out_and_put_back(
         height, width = after.shape[:2]
         middle = slice(height // 2 - 9, height // 2 + 9), slice(width // 2 - 9, width // 2 + 9)
         assert float(before[middle][..., 0].mean()) > 0.6  # the red ball
-        wall = after[middle].mean(dim=(0, 1))
-        assert wall[2] > wall[0] + 0.2  # the blue wall
+        red, _, blue = after[middle].mean(dim=(0, 1)).tolist()
+        assert blue > red + 0.2  # the blue wall
         assert hole_ratio(page, server) < 0.002
         # The edit alone can be saved, and the edit with its patch.
         for value, name in (("removed.ply", "room-without-patch.ply"), (".ply", "room.ply")):
@@ -198,6 +198,22 @@ def test_a_painted_thing_is_taken_out_and_put_back(
 def rows_of(file: Path) -> set[bytes]:
     ply = read_ply(file)
     return {row.tobytes() for row in np.frombuffer(ply.body, np.uint8).reshape(ply.count, -1)}
+
+
+def test_where_nothing_is_open_nothing_is_made(
+    browser: Any, server: Served, tmp_path: Path
+) -> None:
+    flat = wall(width=64, height=48)
+    save_ply(flat.base(), tmp_path / "wall.ply", camera=flat.camera)
+    with scene_on_page(browser, server, tmp_path / "wall.ply", WINDOW) as found:
+        page = found.page
+        page.locator("#reset").click()
+        page.evaluate("spackle.forget()")
+        first, jobs = page.evaluate("spackle.id"), set(server.jobs.by_id)
+        page.locator("#fill").click()
+        page.get_by_text("There is no hole in what you have looked at").wait_for()
+        assert page.evaluate("spackle.id") == first
+        assert set(server.jobs.by_id) == jobs
 
 
 def test_work_can_be_stopped_and_nothing_changes(browser: Any, tmp_path: Path) -> None:

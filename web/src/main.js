@@ -253,7 +253,8 @@ function scripting(ready) {
     },
     /** The present view as the server takes it, for what is filled. */
     camera: () => cameraAt(viewer.description, viewer.stage.eye, viewer.stage.zoom),
-    seen: () => edits.seen.withPresent(),
+    seen: () => edits.seen.withPresent(), // the eyes of the views that would be filled
+    forget: () => (edits.seen.eyes = []),
     /** Eye [x, y, z] in metres at t in 0..1 of a path. */
     eye: (kind, disparity, t) => eyeOnPath(viewer.description, kind, disparity, t),
     /** Where the eye is, and the rows right, down, forward of the camera's rotation. */
