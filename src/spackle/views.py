@@ -247,22 +247,27 @@ class GivenPath:
         """
         if scene.camera is not None and is_at_origin(scene.camera):
             return self.around_photo(photo_name)
-        to_world = torch.eye(4, dtype=torch.float64)
+        camera_to_world = torch.eye(4, dtype=torch.float64)
         if scene.camera is not None:
-            to_world = torch.linalg.inv(scene.camera.world_to_camera.double())
+            camera_to_world = torch.linalg.inv(scene.camera.world_to_camera.double())
 
-        def in_shared_world(cameras: CameraSet) -> CameraSet:
-            """The cameras as they are, with a note."""
+        def from_shared_world(cameras: CameraSet) -> CameraSet:
+            """Cameras in the scene's world, brought into the world of its camera; with a note.
+
+            Cameras without an origin are in the world of a photo's camera already.
+            """
             if cameras.origin is None:
                 return cameras
             note = f"its world is taken as that of {scene.path.name}"
             moved = [
-                dataclasses.replace(camera, world_to_camera=camera.world_to_camera @ to_world)
+                dataclasses.replace(
+                    camera, world_to_camera=camera.world_to_camera @ camera_to_world
+                )
                 for camera in cameras.cameras
             ]
             return dataclasses.replace(cameras, cameras=tuple(moved), notes=(*cameras.notes, note))
 
-        return self._in_world(in_shared_world)
+        return self._in_world(from_shared_world)
 
     def _in_world(self, change_world: Callable[[CameraSet], CameraSet]) -> PathInWorld:
         """The views or keyframes after a change of the cameras' world."""

@@ -53,8 +53,10 @@ class SparsePoints:
 
     def seen_by(self, camera: Camera, name: str) -> SeenPoints:
         """The points that a photo sees; `camera` took it, `name` is the name in the camera file."""
+        # Where nobody noted who sees which point, a photo sees what no nearer point hides.
         if self.observations is None:
             return _unhidden(self.xyz, camera)
+        # A photo without notes sees no points.
         uv, rows = self.observations.get(name, (torch.zeros(0, 2), torch.zeros(0).long()))
         z = camera.to_camera(self.xyz[rows])[:, 2]
         is_in_front = z > 0
@@ -89,7 +91,8 @@ def _colmap_points(model: Path) -> SparsePoints | None:
         for record in read_images(model):
             ids = record.observations["id"]
             row = np.searchsorted(point_ids, ids).clip(max=max(0, len(point_ids) - 1))
-            # A feature that belongs to no reliable point is none.
+            # What the photo shows of a point that is not reliable is left out. The search finds
+            # some row for its id, too, but that row has another id.
             is_known = np.zeros(len(ids), bool) if not len(xyz) else point_ids[row] == ids
             uv = torch.from_numpy(record.observations["uv"][is_known].copy())
             observations[record.name] = (uv, torch.from_numpy(row[is_known]))
@@ -101,6 +104,7 @@ def _ply_positions(file: Path) -> Tensor:
     tables = PlyTables(file)
     vertices = tables.elements_named("vertex")
     names = ("x", "y", "z")
+    # Rows that hold lists, or that follow a table of unknown length, have no known place in a file.
     is_readable = bool(vertices) and set(names) <= set(vertices[0].property_names)
     if not is_readable or not tables.has_known_place(vertices[0]):
         raise InputError(f"{file}: no table of points with x, y and z: export it again")

@@ -24,9 +24,11 @@ MIN_PHOTOS = 2
 # A phone's capture has hundreds of frames, most of which show the same; each photo becomes some
 # 100,000 Gaussians, and is compared with every other one.
 MAX_PHOTOS = 100
-# Where photos lie within a folder or beside its model, in the order in which they are looked for.
+# Where photos lie within a folder or beside its model, in the order in which they are looked for;
+# "" is the folder itself.
 PHOTO_FOLDERS = ("", "images", "images_2", "images_4", "images_8", "rgb", "rgbd", "rgb_images")
-CAMERA_FOLDERS = ("", "keyframes/corrected_cameras", "keyframes/cameras", "cameras")  # Polycam's
+# Where Polycam puts its cameras; those that it has corrected come first.
+POLYCAM_CAMERAS = ("keyframes/corrected_cameras", "keyframes/cameras", "cameras")
 RECORD3D_NAMES = ("metadata.json", "metadata")
 # Folders of depth maps in metres or millimetres, named like the photos.
 DEPTH_FOLDERS = ("depth", "depths", "rgbd")
@@ -101,6 +103,7 @@ def read_capture(folder: Path) -> Capture:
         raise InputError(f"{folder}: no such folder: check the name")
     cameras_at = _where_cameras_are(folder)
     cameras = read_camera_set(cameras_at)
+    # Cameras without an origin stand around a single photo, and have no world of their own.
     if cameras.origin is None or not any(cameras.names):
         raise InputError(
             f"{cameras.source}: its cameras name no photos: give a COLMAP folder, "
@@ -158,11 +161,14 @@ def _points_of(cameras: CameraSet) -> SparsePoints | None:
 
 
 def _where_cameras_are(folder: Path) -> Path:
-    """The file or folder of a folder's cameras, as `read_camera_set` takes it."""
+    """The file or folder of a folder's cameras, as `read_camera_set` takes it.
+
+    Record3D's and Polycam's are looked for here; `read_camera_set` finds all others in the folder.
+    """
     for name in RECORD3D_NAMES:
         if (folder / name).is_file():
             return folder / name
-    for name in CAMERA_FOLDERS[1:]:
+    for name in POLYCAM_CAMERAS:
         if any((folder / name).glob("*.json")):
             return folder / name
     return folder
@@ -174,9 +180,10 @@ def _photos_in(folder: Path) -> list[Path]:
     for name in (*PHOTO_FOLDERS, *POLYCAM_PHOTOS):
         place = folder / name
         if place.is_dir():
-            # COLMAP's pictures may lie in subfolders, one for each camera.
+            # COLMAP's pictures may lie in subfolders of images, one for each camera, so that these
+            # are searched, too (`below`).
             files += list_photos(place, below=name == "images")
-        # The same photos at several sizes: those of the first folder are taken.
+        # The other folders may hold the same photos at smaller sizes.
         if files:
             return files
     return files

@@ -133,12 +133,16 @@ def fit_correction(
 
     inverse = 1 / base_depth[row[usable], column[usable]].double()
     known_inverse = 1 / points.z[usable].double()
+    # x and y from 0 to 1 over the photo.
     place = points.uv[usable].double() / torch.tensor([width, height], dtype=torch.float64)
 
     # First one scale and shift for the whole photo, then what a smooth field can still explain.
     scale, shift = _fit_scale_and_shift(inverse, known_inverse)
-    correction = DepthCorrection(scale, shift, torch.zeros(FIELD_NODES, dtype=torch.float64))
+    no_change = torch.zeros(FIELD_NODES, dtype=torch.float64)  # logarithms of factors of 1
+    correction = DepthCorrection(scale, shift, no_change)
     if with_field:
+        # The field has layers from far to near, which reach over nearly all depths of the photo. A
+        # part of its pixels is enough to know these.
         every_inverse = 1 / base_depth[is_known].double()
         step = max(1, len(every_inverse) // MAX_SAMPLES)
         shifted = correction.shifted_inverse_depth(every_inverse[::step])
@@ -147,9 +151,10 @@ def fit_correction(
             correction = dataclasses.replace(correction, first_layer=low, last_layer=high)
         # log(known / predicted) is what the field should be at each point.
         missing = (known_inverse / correction.inverse_depth(inverse, place)).log()
-        nearness = (correction.shifted_inverse_depth(inverse) - correction.first_layer) / (
-            correction.last_layer - correction.first_layer
-        )
+        # Where each point lies between the farthest layer (0) and the nearest one (1).
+        layers_range = correction.last_layer - correction.first_layer
+        from_first = correction.shifted_inverse_depth(inverse) - correction.first_layer
+        nearness = from_first / layers_range
         field = _fit_field(missing, place, nearness)
         correction = dataclasses.replace(correction, field=field)
 
@@ -169,13 +174,16 @@ def _deviation(errors: Tensor, least: float = MIN_DEVIATION) -> float:
 
 
 def _weights(errors: Tensor, fit_round: int) -> Tensor:
-    """[N] weights by the errors [N]: 1 for none, a quarter at two deviations, 0 for gross ones.
+    """[N] weights of points by their errors [N]: 1 for no error, a quarter at two standard
+    deviations, almost 0 for gross errors.
 
     What counts as gross becomes less from round to round (graduated non-convexity).
     """
+    # Below this, a deviation counts as this. It falls geometrically from FIRST_DEVIATION, at which
+    # hardly any error is gross, to MIN_DEVIATION.
     part = fit_round / (FIT_ROUNDS - 1)  # 0 in the first round, 1 in the last
-    least = FIRST_DEVIATION * (MIN_DEVIATION / FIRST_DEVIATION) ** part
-    relative = errors / (2 * _deviation(errors, least))
+    least_deviation = FIRST_DEVIATION * (MIN_DEVIATION / FIRST_DEVIATION) ** part
+    relative = errors / (2 * _deviation(errors, least_deviation))
     return 1 / (1 + relative.square()).square()
 
 

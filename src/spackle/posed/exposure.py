@@ -27,6 +27,8 @@ def gains_of_photos(photos: Sequence[PlacedPhoto]) -> Tensor:
     Where two photos see the same surface, their colours should agree. The factors make them agree
     best for all pairs of photos together (least squares of the logarithms).
     """
+    # The normal equations of the least squares. The anchor draws each gain weakly towards 1: else
+    # they would have no single solution, as for a photo that shares no surface with others.
     count = len(photos)
     normal = ANCHOR * torch.eye(count, dtype=torch.float64)
     right_side = torch.zeros(count, 3, dtype=torch.float64)
@@ -44,6 +46,7 @@ def gains_of_photos(photos: Sequence[PlacedPhoto]) -> Tensor:
             right_side[second] += weight * log_ratio
     log_gains = torch.linalg.solve(normal, right_side)
     log_gains = (log_gains - log_gains[0]).clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN)
+    # A photo that would hardly change is left exactly as it is.
     is_same = log_gains.abs().amax(dim=1, keepdim=True) < LEAST_CHANGE
     kept_gains: Tensor = log_gains.where(~is_same, 0.0).exp()
     return kept_gains
@@ -54,10 +57,11 @@ def _log_ratio(photo: PlacedPhoto, other: PlacedPhoto) -> tuple[Tensor, float]:
 
     The second value is its weight: the share of Gaussians that both photos show, 0 for too few.
     """
+    # Which of the photo's N Gaussians the other photo sees, and in which of its pixels.
     evidence = evidence_of(photo, other)
     row, column = evidence.row, evidence.column
     own = photo.gaussians.colors  # [N, 3] linear
-    seen = srgb_to_linear(other.rgb[row, column])
+    seen = srgb_to_linear(other.rgb[row, column])  # [N, 3] at the pixels of the other photo
     both = torch.stack([own, seen])
     is_usable = ((both > DARKEST) & (both < BRIGHTEST)).all(dim=2).all(dim=0)
     is_shared = evidence.same_surface & is_usable

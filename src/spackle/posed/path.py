@@ -53,7 +53,7 @@ def path_through(
         focus_depths: how far before each camera the point lies at which the path looks.
         frame_count: number of views.
     """
-    lens = cameras[0].even()
+    lens = cameras[0].even()  # videos have an even width and height
     order = order_along_path(cameras)
     keys = []
     for step, index in enumerate(order):

@@ -105,7 +105,7 @@ class PosedScene:
             InputError: the format is not known, or the file cannot be written.
         """
         content = SceneFile(
-            path=self.photos[0].file.path,
+            path=self.photos[0].file.path,  # gives the scene its name
             gaussians=self.gaussians,
             camera=self.camera,
             base_count=len(self.base),
@@ -242,6 +242,8 @@ def align_photos(
         for index, (file, photo) in enumerate(zip(files, loaded, strict=True)):
             prediction, base_name = _predict(file, photo, pipeline, reporter, kept)
             camera = _camera_at_size(file.camera, prediction.camera)
+            # A measured depth map stands at known depths already. What a network has guessed is
+            # compared with the known depths of some pixels, and corrected.
             if base_name == RGBD:
                 found = None
                 source = "depth map"
@@ -279,7 +281,10 @@ def _predict(
     reporter: Reporter,
     kept: KeptPredictions | None,
 ) -> tuple[BasePrediction, str]:
-    """What the base makes of a photo, and the base's name; from an earlier run if it was kept."""
+    """What the base makes of a photo, and the base's name; from an earlier run if it was kept.
+
+    The base is what turns a photo into Gaussians: a network, or the depth map beside the photo.
+    """
     key = json_digest([file.name, file_fingerprint(file.path, "photo")])
     if kept is not None:
         earlier = kept.load(key)

@@ -108,17 +108,21 @@ def choose_fill_views(scene: SceneFile, options: FillViewsOptions) -> FillViews:
             )
         return _path_around(scene, scene.camera, options, "its own camera")
 
+    # A wrong name is refused before anything else.
     camera_set = read_camera_set(options.cameras)
-    if options.from_camera is None:
-        given = GivenPath(cameras=camera_set).in_scene(scene, page_name(scene.path))
-        assert given.views is not None  # `cameras` gives them
-        views = [_in_world_of_file(view, scene) for view in given.views]
+    index = None
+    if options.from_camera is not None:
+        index = _index_of(camera_set, options.from_camera)
+
+    # `in_scene` gives the cameras as seen from the scene's own camera, if it has one.
+    given = GivenPath(cameras=camera_set).in_scene(scene, page_name(scene.path))
+    assert given.views is not None  # `cameras` gives them
+    views = [_in_world_of_file(view, scene) for view in given.views]
+    if index is None:
         return FillViews(cameras=views, photo_camera=scene.camera, notes=given.notes)
 
-    index = _index_of(camera_set, options.from_camera)
-    given = GivenPath(cameras=camera_set).in_scene(scene, page_name(scene.path))
-    assert given.views is not None
-    camera = _in_world_of_file(given.views[index], scene)
+    # The path leads around one of the file's cameras, as around that of a photo.
+    camera = views[index]
     name = f"camera {camera_set.names[index] or index} of {options.cameras.name}"
     path = _path_around(scene, camera, options, name)
     return dataclasses.replace(path, notes=[*given.notes, *path.notes])
@@ -182,6 +186,9 @@ def _path_around(
         depth_range = _depth_range(scene, camera)
     disparity = options.disparity or scene.disparity or DEFAULT_MAX_DISPARITY
     trajectory = options.trajectory or "rotate-forward"
+
+    # Trajectories begin at a camera at the origin; its pose then brings their views to the scene.
+    # The two views that are farthest to the left and right see behind most edges.
     at_origin = dataclasses.replace(camera, world_to_camera=torch.eye(4))
     around = [
         *trajectory_cameras(trajectory, at_origin, disparity, depth_range, PATH_VIEWS, looped=True),
@@ -191,7 +198,8 @@ def _path_around(
         dataclasses.replace(view, world_to_camera=(view.world_to_camera.double() @ pose).float())
         for view in around
     ]
-    note = f"{len(cameras) + 1} views around {name}: {trajectory}, disparity {disparity:g}"
+    view_count = 1 + len(cameras)  # the camera's own view, too
+    note = f"{view_count} views around {name}: {trajectory}, disparity {disparity:g}"
     return FillViews(
         cameras=[camera, *cameras], photo_camera=camera, notes=[f"{scene.path.name}: {note}"]
     )
@@ -199,9 +207,10 @@ def _path_around(
 
 def _depth_range(scene: SceneFile, camera: Camera) -> DepthRange:
     """The depths of what a camera sees of a scene; ValueError if it sees nothing."""
+    # The camera of the scene's photo: it sees all Gaussians that came from the photo.
     if scene.camera is camera:
         return Scene.of_file(scene).depth_range
-    # Other scenes have Gaussians beside and behind the camera, too.
+    # Any other camera has Gaussians beside and behind it, too.
     uv, z = camera.project(scene.gaussians.means)
     size = uv.new_tensor([camera.width, camera.height])
     in_frame = (z > 0) & ((uv >= 0) & (uv < size)).all(-1)

@@ -150,8 +150,11 @@ def _composite(terms: Floats, planes: tuple[Floats, ...], nearest: bool) -> Floa
 def _fit_planes(terms: Floats, inverse_depth: Floats, random: np.random.Generator) -> list[Floats]:
     """Coefficients [3] of planes, each of which explains a good part of some pixels (RANSAC).
 
+    A plane's inverse depth is linear in the picture: the product of a pixel's terms and the plane's
+    coefficients.
+
     Args:
-        terms: [n, 3] of the pixels.
+        terms: [n, 3] of each pixel: x, y and 1.
         inverse_depth: [n] of the pixels.
         random: draws the pixels through which planes are tried.
     """
@@ -175,7 +178,8 @@ def _fit_planes(terms: Floats, inverse_depth: Floats, random: np.random.Generato
         if counts[best] < max(3, MIN_PLANE_SHARE * len(terms)):
             break
 
-        # The plane through three pixels carries their noise; that of all its pixels does not.
+        # The plane through three pixels carries their noise; that of all its pixels does not. The
+        # weights make the errors relative, as above: terms · plane / inverse depth should be 1.
         on_plane = left[errors[:, best] < PLANE_TOLERANCE]
         weights = 1 / inverse_depth[on_plane]
         plane: Floats = np.linalg.lstsq(

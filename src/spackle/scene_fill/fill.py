@@ -55,7 +55,8 @@ class FilledScene:
     """One set of added Gaussians for all views."""
 
     aux: Gaussians
-    # [H, W, 3] uint8 sRGB: final renderings of some views, by the view's index
+    # [H, W, 3] uint8 sRGB: final renderings of some views, by the view's index; nobody needs to
+    # render these views again
     pictures: Mapping[int, Tensor]
 
 
@@ -131,6 +132,7 @@ def fill_scene(
         keep_empty or [None] * len(cameras),
         guarded_views,
     )
+    # To visit a view is to render it with all Gaussians so far, and to fill its holes.
     for count, index in enumerate(filling.order, start=1):
         if filling.needs_visit(index):
             filling.visit(index)
@@ -306,7 +308,7 @@ def _fill_in_passes(
     with_underlays: bool,
     fillable: Tensor | None = None,
 ) -> _FilledHoles:
-    """Fill the holes of a view, render it, and fill the holes that stayed open.
+    """Fill the holes of a view, render it, and fill once more the holes that stayed open.
 
     The added Gaussians are returned, and are also added to the scene of `renderer`.
 
@@ -327,13 +329,15 @@ def _fill_in_passes(
         # the second pass goes without it.
         pass_context = context if pass_index == 0 else context.without_network
         view = pass_context.view(rendering, camera)
+        # `view.mask` has all cells (2×2 pixels) that touch a hole; of these, some may be filled.
         mask = cells_to_fill(view, fillable)
         if not bool(mask.any()):
             break
         filling = fill_holes(pass_context, view, guards, mask)
         if with_underlays:
-            # Holes that stay open are no surface that could be continued.
-            underlays.append(rim_underlay(mask, filling.surfaces, camera, view.mask & ~mask))
+            # Holes that may not be filled are no surface that could be continued beneath a rim.
+            open_cells = view.mask & ~mask
+            underlays.append(rim_underlay(mask, filling.surfaces, camera, open_cells))
         if not len(filling.gaussians):
             break
         aux.append(filling.gaussians)

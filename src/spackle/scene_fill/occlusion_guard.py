@@ -68,10 +68,11 @@ class OcclusionGuard:
         is_hole = view.alpha < threshold
         surface_depth = torch.where(is_hole, 0, view.depth).float()
         if keep_empty is not None:
-            # Empty space is like a surface at infinity: everything would hide it. Pixels near other
-            # pixels are left out, lest the filter below takes this depth into surfaces.
-            outside = maximum_filter(~keep_empty.cpu(), 2 * WINDOW_RADIUS_PX)
-            surface_depth = torch.where(outside, surface_depth, torch.inf)
+            # Empty space is like a surface at infinity: everything would hide it. Not so at its
+            # border: the filter below would carry this infinite depth onto the surfaces beside it,
+            # so a strip of twice the filter's radius is left as it is.
+            is_beside_space = maximum_filter(~keep_empty.cpu(), 2 * WINDOW_RADIUS_PX)
+            surface_depth = torch.where(is_beside_space, surface_depth, torch.inf)
 
         # A Gaussian reaches some pixels around its centre, and may hide a surface at any of them.
         # So each pixel keeps the greatest depth within a window around it.

@@ -84,6 +84,7 @@ def rim_underlay(
         rgb=coarse_rgb.permute(1, 2, 0),
         unit=surfaces.unit,
     )
+    # Without deltas, which a network would predict: the guesses become Gaussians as they are.
     underlay = compose(cells.select(rim), deltas=None, camera=camera)
 
     # One Gaussian covers 3×3 cells, so it is three times as large as one for a single cell.

@@ -208,9 +208,10 @@ class Jobs:
         id = folder.name.removeprefix(UPLOAD_PREFIX)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         if edit is not None:
-            changes = {"edit": edit.kind, **edit._asdict()}
-            del changes["kind"]
-            job = job.model_copy(update=changes)
+            # A job has the parts of its edit as fields of its own; the kind is the field `edit`.
+            parts = edit._asdict()
+            kind = parts.pop("kind")
+            job = job.model_copy(update={"edit": kind, **parts})
         job.save()
         # `reserve_place` counts folders and jobs, so the two change together.
         with self._lock:

@@ -47,10 +47,11 @@ def _edit_form(options: type[BaseModel], **files: dict[str, str]) -> dict[str, A
         **files: the descriptions of its files, by their names.
     """
     schema = options.model_json_schema()
-    # References lead to the whole description, so the camera's schema is put in their place.
+    # pydantic describes a camera once, and refers to it where it is used. Such references would not
+    # be found from within the whole interface, so the description is put in their place.
     camera = schema.pop("$defs")["CameraEntry"]
     for field in schema["properties"].values():
-        if "$ref" in field:
+        if "$ref" in field:  # a field with one camera; all others are lists of cameras
             del field["$ref"]
             field.update({**camera, "description": field["description"]})
         else:
@@ -236,7 +237,8 @@ def _add_edit(edit: Edit, upload_folder: Path, jobs: Jobs, parent: Job) -> Job:
         name=parent.name,
         source=EDIT_SOURCE,
         depth=None,
-        # Those of the videos go on; files are made when they are asked for.
+        # The options for videos, such as the trajectory, hold for the edited scene, too. Its files
+        # are made when somebody asks for them.
         options={**parent.options, "files": []},
         edit=edit,
     )

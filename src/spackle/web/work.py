@@ -194,6 +194,7 @@ class SceneWork:
     def _edit_scene(self, job: Job, reporter: JobReporter) -> Scene:
         """Make the scene of a job that edits another one, and write what the page draws.
 
+        With a mask, the job removes a thing; without, it fills what its cameras see open.
         InputError if a mask marks nothing, or everything.
         """
         cameras = [camera_from_json(entry, "camera") for entry in job.cameras]
@@ -208,6 +209,7 @@ class SceneWork:
             )
         write_json(report, job.results / REPORT_NAME)
 
+        # The page keeps the note, the lens and the paths that it had before the edit.
         scene = Scene.load(scene_file)
         with reporter.stage("page"):
             former = json.loads((job.folder / FORMER_PAGE).read_bytes())
