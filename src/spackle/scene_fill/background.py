@@ -55,7 +55,10 @@ MIN_WITNESSES = 2  # if fewer know of a point, nothing is known; a single other 
 
 @dataclasses.dataclass(frozen=True)
 class Witness:
-    """What a camera knows of the scene, in a small picture."""
+    """What a camera knows of the scene, in a small picture.
+
+    Other views ask it whether there may be a surface at a point that they cannot see themselves.
+    """
 
     camera: Camera  # of the small picture, float64
     depth: Tensor  # [h, w] z of opaque pixels, 0 elsewhere
@@ -130,7 +133,10 @@ def find_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> lis
 def has_no_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> bool:
     """Whether all emptiness is a hole: half of the views have none, or one shows the whole scene
     without any.
+
+    Such a scene is a room, or was made from a photo, which has a surface in each pixel.
     """
+    # Views in which hardly a pixel is empty.
     closed_views = [view for view in views if view.empty_ratio <= CLOSED_VIEW_RATIO]
     if 2 * len(closed_views) >= len(views):
         return True

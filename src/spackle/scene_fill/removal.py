@@ -44,7 +44,9 @@ MIN_SHARE = 0.5  # of what shows of a Gaussian must lie in the thing
 ROUGHNESS_RATIO = 0.02
 MIN_THING_SHARE = 0.9
 MAX_EMPTY_SHARE = 0.05  # of a view's pixels; a view with less emptiness has a background
-GREY = 0.5  # colour of all Gaussians while it is measured in which pixels they show
+# Colour of all Gaussians while it is measured in which pixels they show. It keeps the picture away
+# from 0 and 1, where it is cut off and would not answer to a Gaussian's colour.
+GREY = 0.5
 
 
 def marked_gaussians(
@@ -220,13 +222,14 @@ def _thing_in_picture(rendering: Rendering, wide_mask: Tensor) -> tuple[Tensor, 
 
     Returns:
         [H, W] bool: the masked pixels that show something in front of the background; the
-        background's inverse depth [H, W]; and by which ratio less the depth of something in front
-        of the background is at least.
+        background's inverse depth [H, W]; and the margin: what is in front of the background has
+        more than (1 + margin) times its inverse depth.
     """
     is_open = hole_mask(rendering.alpha)
     behind = background_depth(rendering.depth, is_open, wide_mask)
+    # The background's own noise must not be taken for things in front of it.
     margin = min(max(NOISE_SIGMAS * behind.noise, MIN_MARGIN), MAX_MARGIN)
-    nearness = 1 / rendering.depth.clamp_min(1e-30)
+    nearness = 1 / rendering.depth.clamp_min(1e-30)  # inverse depth of what is visible
     in_front = nearness > behind.inverse_depth * (1 + margin)
     thing = wide_mask & in_front & (rendering.alpha > 0)
     return thing, behind.inverse_depth, margin
@@ -251,17 +254,19 @@ def _foot(
 ) -> Tensor:
     """[H, W] bool: the pixels in which a thing may touch the surface that it stands on.
 
-    Where a thing rises from a floor, it is hardly nearer than the floor behind it, so depth cannot
-    tell the two apart. This ends where the floor has receded by the margin.
+    Where a thing rises from a floor, it is hardly nearer than the floor that is seen beside it, so
+    depth cannot tell the two apart. A little higher up in the picture, the floor behind the thing
+    is farther away. The foot reaches until this distance is the margin: from there on, depth tells.
 
     Args:
         thing: [H, W] bool: the pixels in which the thing is in front of the background.
         rendering: the view.
         background: [H, W] inverse depth behind the thing.
-        margin: by which ratio the thing is in front of the background at least.
-        height: by which ratio the foot is in front of the background at most.
+        margin: the thing has at least (1 + margin) times the background's inverse depth.
+        height: the foot has at most (1 + height) times the background's inverse depth.
     """
-    nearness = 1 / rendering.depth.clamp_min(1e-30)
+    nearness = 1 / rendering.depth.clamp_min(1e-30)  # inverse depth of what is visible
+    # The lowest part of the thing, just in front of the background.
     rising = thing & (nearness < background * (1 + height))
     # At an outline before a far background, too, pixels lie between the two depths: they show both.
     is_far_in_front = nearness > background * (1 + OUTLINE_RATIO)
@@ -272,6 +277,7 @@ def _foot(
     logarithm = background.clamp_min(1e-30).log()
     down, right = torch.gradient(logarithm)
     recession = float(torch.hypot(down, right)[rising].median())
+    # After so many pixels, the background has receded by the margin.
     largest_px = MAX_FOOT_RATIO * math.hypot(*thing.shape)
     reach_px = largest_px if recession <= 0 else min(largest_px, margin / recession)
     return maximum_filter(rising, math.ceil(reach_px))
@@ -282,9 +288,11 @@ def _shown_pixels(
 ) -> list[Tensor]:
     """In how many pixels of up to three regions [H, W] each Gaussian shows, [N] for each region.
 
-    A pixel that is shared with others counts in part. It is the derivative of the picture's light
-    by the Gaussian's own: each region is asked in a colour of its own.
+    A pixel that is shared with others counts in part.
     """
+    # A pixel's light is the sum of the Gaussians' light, each times its weight in this pixel. So
+    # the derivative of a region's light by that of a Gaussian is the sum of its weights there: the
+    # number of pixels. Each region is measured in a colour channel of its own, all in one go.
     colors = torch.full_like(gaussians.colors, GREY).requires_grad_()
     grey = Gaussians(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors
