@@ -95,7 +95,10 @@ def main() -> None:
         "what was seen, worst view | added / by a second fill |"
     )
     print("|---|---|---|---|---|---|---|")
+    wanted = sys.argv[1:]
     for name, scene in scenes().items():
+        if wanted and not any(word in name for word in wanted):
+            continue
         print(row(name, scene), flush=True)
 
 

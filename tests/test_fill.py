@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.foreign_scenes import inria_table, ply
+from helpers.open_scenes import cup
 from helpers.scenes import box_before_wall, random_harmonics, same_bits, shifted
 from torch import Tensor
 
@@ -18,10 +19,11 @@ from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.formats.scene_files import load_scene
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio
-from spackle.results.fill_views import FillViewsOptions
+from spackle.results.fill_views import FillViewsOptions, choose_fill_views
 from spackle.results.filled_scene import fill_saved_scene
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Reporter
+from spackle.scene import Scene
 
 BOX = box_before_wall(width=64, height=48, focal=54)
 SCALE = 3.0
@@ -155,3 +157,76 @@ def test_a_filled_ply_begins_with_the_bytes_of_the_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="this is the scene itself"):
         fill_saved_scene(given, given, views_of(cameras), Lines())
     assert not (tmp_path / "no.ply").exists()
+
+
+class Said(Reporter):
+    """Keeps what is logged."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def log(self, line: str) -> None:
+        self.lines.append(line)
+
+
+def test_a_path_around_a_camera_is_filled(tmp_path: Path) -> None:
+    given = tmp_path / "scene.ply"
+    given.write_bytes(ply(inria_table(scene())))
+    cameras = write_cameras(tmp_path / "cameras.json", CAMERAS)
+    around = FillViewsOptions(cameras=cameras, from_camera="0", disparity=0.1)
+    said = Said()
+    fill_saved_scene(given, tmp_path / "filled.ply", around, said, device="cpu")
+    assert any("33 views around camera 0 of cameras.json" in line for line in said.lines)
+    filled = load_scene(tmp_path / "filled.ply").gaussians
+    views = choose_fill_views(load_scene(given), around).cameras
+    assert holes(filled, views[-1]) < 0.005 < holes(scene(), views[-1])
+
+    # Spackle's own scene knows its camera.
+    own = Scene(BOX.base(), Gaussians.empty(), BOX.camera, disparity=0.1)
+    own.save(tmp_path / "own.ply")
+    loaded = load_scene(tmp_path / "own.ply")
+    chosen = choose_fill_views(loaded, FillViewsOptions(trajectory="swipe"))
+    assert chosen.photo_camera is not None
+    assert "swipe, disparity 0.1" in chosen.notes[0]
+    assert holes(BOX.base(), chosen.cameras[-1]) > 0.005
+
+
+def test_an_orbit_shows_a_scene_from_all_sides(tmp_path: Path) -> None:
+    given = tmp_path / "scene.ply"
+    thing = cup(size=3.0)
+    given.write_bytes(ply(inria_table(thing.given)))
+    loaded = load_scene(given)
+    up = torch.tensor([0.0, -1.0, 0.0])
+    for word in ("-y", "0,-2,0"):
+        cameras = choose_fill_views(loaded, FillViewsOptions(up=word)).cameras
+        assert len(cameras) == 12
+        for camera in cameras:
+            uv, z = camera.project(thing.given.means)
+            inside = (z > 0) & ((uv >= 0) & (uv < torch.tensor([960.0, 720.0]))).all(1)
+            assert float(inside.float().mean()) > 0.94
+            assert float(camera.position @ up) > 0
+        assert float(torch.stack([c.position for c in cameras]).std(0)[[0, 2]].min()) > 3
+
+
+def test_views_that_cannot_be_chosen_are_refused(tmp_path: Path) -> None:
+    given = tmp_path / "scene.ply"
+    given.write_bytes(ply(inria_table(scene())))
+    cameras = write_cameras(tmp_path / "cameras.json", CAMERAS)
+    loaded = load_scene(given)
+    for options, problem in (
+        (FillViewsOptions(), "scene.ply: has no camera of its own"),
+        (FillViewsOptions(cameras=cameras, from_camera="7"), "has no camera 7"),
+        (FillViewsOptions(up="sideways"), "give an axis"),
+        (FillViewsOptions(up="0,0,0"), "give an axis"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            choose_fill_views(loaded, options)
+    for options, problem in (
+        (FillViewsOptions(from_camera="0"), "give the file that has this camera"),
+        (FillViewsOptions(cameras=cameras, trajectory="orbit"), "`trajectory`: `cameras` gives"),
+        (FillViewsOptions(cameras=cameras, up="y"), "leave out `cameras`"),
+        (FillViewsOptions(disparity=5.0), "`disparity` must be"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            options.check()

@@ -60,6 +60,12 @@ def test_the_sky_over_an_outdoor_scene_stays_empty() -> None:
         assert background < 0.015
 
 
+def test_a_hole_in_the_ground_that_the_pictures_border_cuts_is_filled() -> None:
+    holes, background = shares_filled(houses_around(count=16, hole=1.1))
+    assert holes > 0.95
+    assert background < 0.002
+
+
 def test_a_room_and_a_photo_have_no_background() -> None:
     scene, result = filled(room)
     assert plan_fill(scene.given, scene.cameras, RENDERER).fillable is None

@@ -1,9 +1,10 @@
 """Which empty pixels of a view are background, such as sky, and which are holes to be filled.
 
 The rule: where at least half of the cameras see no emptiness, or one camera sees the whole scene
-without any (a photo's own camera), nothing is background. Elsewhere, emptiness that is open to the
-picture's border is background. Emptiness that surfaces enclose is a hole, unless the other cameras
-look through the space behind it and see that nothing is there, as behind a cup's handle.
+without any (a photo's own camera), nothing is background. Elsewhere, a region of emptiness that is
+open to the picture's border is background, unless a single side of the picture cuts it off and the
+space behind it is hidden from the other cameras, as beneath a lawn. A region that surfaces enclose
+is a hole, unless the other cameras see that nothing is behind it, as behind a cup's handle.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ GAP_WIDTHS = 0.02
 MIN_HOLE_PX = 8
 WITNESSES = 8  # other cameras that are asked what lies behind enclosed emptiness
 WITNESS_SIDE_PX = 160  # long side of the pictures in which they are asked
-RAYS_A_REGION = 16  # of an enclosed region; about so many of its pixels are asked for
+RAYS_A_REGION = 64  # about so many of the pixels of a region are asked for
 # Points along each of these rays, evenly in log depth, from this part of the nearest surface's
 # depth to this multiple of the farthest one's.
 RAY_DEPTHS = 48
@@ -53,6 +54,12 @@ BEHIND_RIM_RATIO = 1.05  # points so much farther away than the rim are behind i
 MIN_WITNESSES = 2  # if fewer know of a point, nothing is known; a single other camera is enough
 
 
+def _every_nth(camera: Camera) -> slice:
+    """The rows or columns of a view of a camera that its small picture keeps."""
+    step = max(1, math.ceil(max(camera.width, camera.height) / WITNESS_SIDE_PX))
+    return slice(step // 2, None, step)  # the middle of each block of step×step pixels
+
+
 @dataclasses.dataclass(frozen=True)
 class Witness:
     """What a camera knows of the scene, in a small picture.
@@ -62,7 +69,12 @@ class Witness:
 
     camera: Camera  # of the small picture, float64
     depth: Tensor  # [h, w] z of opaque pixels, 0 elsewhere
-    is_open: Tensor  # [h, w] bool: emptiness that is open to the picture's border
+    is_open: Tensor  # [h, w] bool: emptiness that is known to be background
+
+    def with_background(self, camera: Camera, is_open: Tensor) -> Witness:
+        """The same view, with the background [H, W] bool of the view of `camera`."""
+        every = _every_nth(camera)
+        return dataclasses.replace(self, is_open=is_open[every, every])
 
     @staticmethod
     def of(camera: Camera, depth: Tensor, is_open: Tensor) -> Witness:
@@ -71,10 +83,10 @@ class Witness:
         Args:
             camera: of the view.
             depth: [H, W] z of opaque pixels, 0 elsewhere.
-            is_open: [H, W] bool: emptiness that is open to the picture's border.
+            is_open: [H, W] bool: emptiness that is known to be background.
         """
-        step = max(1, math.ceil(max(camera.width, camera.height) / WITNESS_SIDE_PX))
-        every = slice(step // 2, None, step)  # the middle of each block of step×step pixels
+        every = _every_nth(camera)
+        step = every.step
         small_depth = depth[every, every].double()
         height, width = small_depth.shape
         blocks = camera.to("cpu", torch.float64).cropped(0, 0, width * step, height * step)
@@ -88,8 +100,8 @@ class ViewEmptiness:
     camera: Camera
     is_empty: Tensor  # [H, W] bool: opacity below the threshold of holes
     is_open: Tensor  # [H, W] bool: emptiness that is open to the picture's border
-    rim_depth: Tensor  # [n] z of the surface nearest in the picture to each enclosed empty pixel
-    witness: Witness
+    rim_depth: Tensor  # [H, W] float32 z of the surface that is nearest in the picture
+    witness: Witness  # which knows of no background yet
 
     @staticmethod
     def of(rendering: Rendering, camera: Camera) -> ViewEmptiness:
@@ -101,10 +113,10 @@ class ViewEmptiness:
 
         # Of the nearest surface pixel; negative if there is no surface in the view.
         nearest = torch.from_numpy(nearest_known_pixels(is_empty.numpy())).long()
-        row, column = nearest[:, is_empty & ~is_open].clamp_min(0)
-        rim_depth = depth[row, column].double()
+        row, column = nearest.clamp_min(0)
+        nothing_known = torch.zeros_like(is_empty)
         return ViewEmptiness(
-            camera, is_empty, is_open, rim_depth, Witness.of(camera, depth, is_open)
+            camera, is_empty, is_open, depth[row, column], Witness.of(camera, depth, nothing_known)
         )
 
     @property
@@ -113,21 +125,56 @@ class ViewEmptiness:
         return float(self.is_empty.float().mean())
 
 
-def find_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> list[Tensor]:
-    """For each view [H, W] bool: the empty pixels that are background, and are to stay empty.
+@dataclasses.dataclass(frozen=True)
+class ViewBackground:
+    """The background of a view."""
+
+    is_background: Tensor  # [H, W] bool: empty pixels that are to stay empty
+    # [H, W] bool: those of them that are open to the picture's border; nothing may appear there
+    is_open: Tensor
+
+
+def find_background(
+    gaussians: Gaussians, views: Sequence[ViewEmptiness]
+) -> list[ViewBackground] | None:
+    """The background of each view; None if all emptiness is holes.
 
     Args:
         gaussians: the scene.
         views: the scene as its cameras see it.
     """
     if has_no_background(gaussians, views):
-        return [torch.zeros_like(view.is_empty) for view in views]
-    witnesses = [view.witness for view in views]
-    depths = _ray_depths(witnesses)
-    return [
-        view.is_open | _seen_past(view, _spread_witnesses(witnesses, index), depths)
-        for index, view in enumerate(views)
-    ]
+        return None
+    depths = _ray_depths([view.witness for view in views])
+
+    def with_backgrounds(backgrounds: Sequence[Tensor]) -> list[Witness]:
+        """All witnesses, knowing the background [H, W] bool of their views."""
+        return [
+            view.witness.with_background(view.camera, is_open)
+            for view, is_open in zip(views, backgrounds, strict=True)
+        ]
+
+    # First the regions that are open to the border. Sky and the space around a thing reach several
+    # sides of the picture; what a single side cuts off may be a hole, so the others are asked.
+    cut_regions = [_cut_by_one_side(view.is_open) for view in views]
+    witnesses = with_backgrounds(
+        [view.is_open & ~cut for view, cut in zip(views, cut_regions, strict=True)]
+    )
+    open_backgrounds = []
+    for index, view in enumerate(views):
+        others = _spread_witnesses(witnesses, index)
+        answers = _ask_regions(view, cut_regions[index], others, depths)
+        open_backgrounds.append(view.is_open & ~answers.is_hidden)
+
+    # Then the regions that surfaces enclose.
+    witnesses = with_backgrounds(open_backgrounds)
+    result = []
+    for index, view in enumerate(views):
+        enclosed = view.is_empty & ~view.is_open
+        answers = _ask_regions(view, enclosed, _spread_witnesses(witnesses, index), depths)
+        is_open = open_backgrounds[index]
+        result.append(ViewBackground(is_open | answers.is_clear | answers.is_speck, is_open))
+    return result
 
 
 def has_no_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> bool:
@@ -168,6 +215,15 @@ def _open_to_border(empty: Tensor) -> Tensor:
     return maximum_filter(is_open, radius) & empty
 
 
+def _cut_by_one_side(is_open: Tensor) -> Tensor:
+    """[H, W] bool: the regions of a mask [H, W] that reach exactly one side of the picture."""
+    regions = torch.from_numpy(_label_regions(is_open.numpy()))
+    side_count = torch.zeros_like(regions)
+    for side in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
+        side_count += torch.isin(regions, side[side > 0])
+    return side_count == 1
+
+
 def _spread_witnesses(witnesses: Sequence[Witness], index: int) -> list[Witness]:
     """Up to 8 other witnesses than the one at `index`, whose eyes are far from one another."""
     others = [witness for place, witness in enumerate(witnesses) if place != index]
@@ -196,53 +252,69 @@ def _ray_depths(witnesses: Sequence[Witness]) -> Tensor:
     return first * (last / first) ** parts
 
 
-def _seen_past(view: ViewEmptiness, witnesses: Sequence[Witness], depths: Tensor) -> Tensor:
-    """[H, W] bool: the regions of enclosed emptiness behind which other cameras see nothing, and
-    specks.
+@dataclasses.dataclass(frozen=True)
+class RegionAnswers:
+    """What other cameras say of regions of emptiness: [H, W] bool, true in whole regions."""
+
+    is_hidden: Tensor  # most rays end hidden: behind no hidden point is a clear one
+    is_clear: Tensor  # most rays pass clear points behind the rim, and no hidden one
+    is_speck: Tensor  # the region is too small to be seen
+
+
+def _ask_regions(
+    view: ViewEmptiness, mask: Tensor, witnesses: Sequence[Witness], depths: Tensor
+) -> RegionAnswers:
+    """What other cameras say of the space behind each region of a mask.
 
     Args:
         view: the view.
+        mask: [H, W] bool: some of its empty pixels.
         witnesses: the other cameras.
         depths: [D] of the points that are asked for along a ray.
     """
-    enclosed = view.is_empty & ~view.is_open
-    regions = torch.from_numpy(_label_regions(enclosed.numpy())).flatten().long()  # [H·W]
+    regions = torch.from_numpy(_label_regions(mask.numpy())).flatten().long()  # [H·W]
     pixels = regions.nonzero()[:, 0]
     if not len(pixels):
-        return torch.zeros_like(enclosed)
+        return RegionAnswers(*(torch.zeros_like(mask) for _ in range(3)))
 
-    # About 16 pixels of each region, evenly among its pixels in the order of its label.
+    # Some pixels of each region, evenly among its pixels in the order of its label.
     pixels = pixels[regions[pixels].argsort(stable=True)]
     sizes = regions.bincount()
     first_places = sizes[1:].cumsum(0) - sizes[1:]  # of the regions 1, 2, … in `pixels`
     labels = regions[pixels]
     ranks = torch.arange(len(pixels)) - first_places[labels - 1]
     strides = (sizes[labels] / RAYS_A_REGION).ceil().long()
-    is_asked = (ranks + strides // 2) % strides == 0
-    asked = pixels[is_asked]
+    asked = pixels[(ranks + strides // 2) % strides == 0]
 
     camera = view.camera.to("cpu", torch.float64)
     uv = camera.pixel_centers().flatten(0, 1)[asked].double()
-    rim_depth = torch.zeros(enclosed.shape, dtype=torch.float64)
-    rim_depth[enclosed] = view.rim_depth
-    is_past = _rays_are_clear(camera, uv, rim_depth.flatten()[asked], witnesses, depths)
+    rim_depth = view.rim_depth.flatten()[asked].double()
+    is_hidden, is_clear = _ask_rays(camera, uv, rim_depth, witnesses, depths)
+
     asked_labels = regions[asked]
-    past_counts = asked_labels[is_past].bincount(minlength=len(sizes))
     asked_counts = asked_labels.bincount(minlength=len(sizes))
-    region_is_past = (2 * past_counts > asked_counts) | (sizes < MIN_HOLE_PX)
-    region_is_past[0] = False  # the label of all other pixels
-    return region_is_past[regions].reshape(enclosed.shape)
+
+    def where_most(answers: Tensor) -> Tensor:
+        """[H, W] bool: the regions in which most of the rays [n] have the answer."""
+        counts = asked_labels[answers].bincount(minlength=len(sizes))
+        # No ray was asked for the label 0 of all other pixels.
+        return (2 * counts > asked_counts)[regions].reshape(mask.shape)
+
+    is_speck = (sizes < MIN_HOLE_PX)[regions].reshape(mask.shape) & mask
+    return RegionAnswers(where_most(is_hidden), where_most(is_clear), is_speck)
 
 
-def _rays_are_clear(
+def _ask_rays(
     camera: Camera, uv: Tensor, rim_depth: Tensor, witnesses: Sequence[Witness], depths: Tensor
-) -> Tensor:
-    """[n] bool: rays that, behind the rim of their region, pass no point that most witnesses call
-    hidden, but some that they call clear.
+) -> tuple[Tensor, Tensor]:
+    """Two [n] bool: rays that end hidden, and rays that are clear, behind the rim of their region.
+
+    A ray ends hidden if its last point of which the witnesses know is hidden. It is clear if it
+    passes clear points and no hidden one.
 
     A witness calls a point hidden if it lies behind a surface; clear if it lies before one, or
-    before emptiness that is open to the border. It is unsure of a point before other emptiness,
-    which may be a hole, and says nothing of a point outside of its frame.
+    before known background. It is unsure of a point before other emptiness, which may be a hole,
+    and says nothing of a point outside of its frame.
 
     Args:
         camera: of the view, float64.
@@ -280,9 +352,13 @@ def _rays_are_clear(
 
     # Before the rim there is nothing, as the view itself shows.
     is_behind_rim = z_of_points > BEHIND_RIM_RATIO * rim_depth
-    passes_hidden = (is_hidden & is_behind_rim).any(0)
-    passes_clear = (is_known & ~is_hidden & is_behind_rim).any(0)
-    return passes_clear & ~passes_hidden
+    hidden = is_hidden & is_behind_rim
+    clear = is_known & ~is_hidden & is_behind_rim
+    # From 1 on, in the order of the depths; 0 if there is none.
+    numbers = torch.arange(1, len(depths) + 1)[:, None]
+    last_hidden = (numbers * hidden).amax(0)
+    last_clear = (numbers * clear).amax(0)
+    return last_hidden > last_clear, (last_hidden == 0) & (last_clear > 0)
 
 
 @kernel

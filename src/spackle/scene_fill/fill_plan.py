@@ -74,11 +74,12 @@ def plan_fill(
     if given is None and background == "keep":
         # The photo's own view tells more of the scene than any other.
         photo_views = [] if photo_camera is None else [emptiness(photo_camera)]
-        backgrounds = find_background(gaussians, [*views, *photo_views])[: len(views)]
-        background_ratios = [float(pixels.float().mean()) for pixels in backgrounds]
-        if any(background_ratios):
-            given = [~pixels for pixels in backgrounds]
-            keep_empty = [view.is_open for view in views]
+        backgrounds = find_background(gaussians, [*views, *photo_views])
+        if backgrounds is not None:
+            backgrounds = backgrounds[: len(views)]
+            background_ratios = [float(view.is_background.float().mean()) for view in backgrounds]
+            given = [~view.is_background for view in backgrounds]
+            keep_empty = [view.is_open for view in backgrounds]
 
     return FillPlan(
         photo_camera=photo_camera or cameras[choose_reference(views)],
