@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
+import posed_photos
+import posed_scenes
+import pytest
 import suite
 import torch
 from naive_renderer import naive_render
 from suite_scenes import holed_scene, photo_scene
 
+from spackle.posed.capture import read_capture
 from spackle.render import CpuRenderer
 
 
@@ -28,3 +33,25 @@ def test_the_suite_measures_the_renderer_and_a_completion(tmp_path: Path) -> Non
         assert section["figures"]
         assert "not run" not in section["facts"]
     assert "naive over ours" in (tmp_path / "suite.md").read_text()
+
+
+def test_a_rendered_scene_becomes_photos_with_cameras_of_which_some_are_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(posed_scenes, "WIDTH", 64)
+    monkeypatch.setattr(posed_scenes, "HEIGHT", 48)
+    folder = tmp_path / "still_life"
+    monkeypatch.setattr(sys, "argv", ["posed_scenes.py", "still_life", str(folder)])
+    posed_scenes.main()
+
+    capture = read_capture(folder)
+    assert len(capture.photos) == len(posed_scenes.EYES)
+    assert capture.points is not None
+    seen = [capture.points.seen_by(photo.camera, photo.name) for photo in capture.photos]
+    assert min(len(points.z) for points in seen) > 100
+
+    # The eyes far to the left and right are those farthest from the middle.
+    assert sorted(posed_photos.choose(capture, "spread", 3))[1:] == [6, 7]
+    near = posed_photos.choose(capture, "near", 3)
+    assert set(near) <= {0, 3, 4, 5}
+    assert len(set(posed_photos.choose(capture, "random-1", 3))) == 3

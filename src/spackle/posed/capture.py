@@ -63,11 +63,12 @@ class PosedFile:
         return dataclasses.replace(photo, focal_px=focal_px, focal_source=FocalSource.CAMERAS)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Capture:
     """Photos with known cameras in one world."""
 
     folder: Path
+    cameras_file: Path  # the file or folder of the cameras
     kind: str  # who wrote the cameras, such as "COLMAP"
     photos: tuple[PosedFile, ...]  # in the order of the file of cameras
     points: SparsePoints | None  # None: the cameras came without points
@@ -77,7 +78,7 @@ class Capture:
     @property
     def source_files(self) -> list[Path]:
         """All files that decide the result: cameras, points, photos and depth maps."""
-        files = camera_source_files(self.folder_of_cameras)
+        files = camera_source_files(self.cameras_file)
         if self.points is not None:
             files.append(self.points.source)
         for photo in self.photos:
@@ -85,8 +86,6 @@ class Capture:
             if photo.depth is not None:
                 files.append(photo.depth)
         return files
-
-    folder_of_cameras: Path = dataclasses.field(kw_only=True)
 
 
 def read_capture(folder: Path) -> Capture:
@@ -145,12 +144,12 @@ def read_capture(folder: Path) -> Capture:
     _refuse_doubles(photos, cameras.source)
     return Capture(
         folder=folder,
+        cameras_file=cameras_at,
         kind=cameras.kind,
         photos=tuple(photos),
         points=_points_of(cameras),
         is_metric=cameras.is_metric,
         notes=tuple(notes),
-        folder_of_cameras=cameras_at,
     )
 
 
@@ -192,7 +191,7 @@ def _photos_in(folder: Path) -> list[Path]:
 def _photo_of(name: str, files: Sequence[Path]) -> Path | None:
     """The photo that a file of cameras calls `name`; suffix and folders may differ."""
     wanted = PurePosixPath(name.replace("\\", "/"))
-    # The longest common end of the two paths decides between photos of the same name.
+    # Of photos of the same name, that in a folder of the same name is meant.
     with_name = [file for file in files if file.name == wanted.name]
     candidates = with_name or [file for file in files if file.stem in (wanted.stem, wanted.name)]
     if len(candidates) <= 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import torch
@@ -14,10 +15,10 @@ from spackle.core.keyframes import Keyframe, KeyframePath
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 
 SECONDS_PER_PHOTO = 1.5  # from one photo to the next
-MAX_SECONDS = 20.0  # of the whole way there and back
+MIN_SECONDS = 4.0  # of the whole way there and back, as long as a photo's video
+MAX_SECONDS = 20.0
 FILLED_PATH_VIEWS = 24  # views along the path that are filled; between them holes look alike
 AROUND_PHOTOS = 8  # so many photos also get a view to their left and one to their right
-FOCUS_QUANTILE = 0.5  # of the depths before a camera: the path looks at points this far away
 
 
 def order_along_path(cameras: Sequence[Camera]) -> list[int]:
@@ -78,19 +79,16 @@ def path_through(
 
 def path_seconds(photo_count: int) -> float:
     """The duration of the way through so many photos and back."""
-    return min(MAX_SECONDS, max(4.0, 2 * SECONDS_PER_PHOTO * (photo_count - 1)))
+    return min(MAX_SECONDS, max(MIN_SECONDS, 2 * SECONDS_PER_PHOTO * (photo_count - 1)))
 
 
 def focus_depth(gaussians: Gaussians, camera: Camera) -> float:
     """The median depth of the Gaussians that lie in a camera's picture, in the world's unit."""
     uv, z = camera.project(gaussians.means)
     is_inside = (z > 0) & ((uv >= 0) & (uv < torch.tensor([camera.width, camera.height]))).all(1)
+    # A camera that sees nothing of the scene still needs a point to look at.
     depths = z[is_inside] if bool(is_inside.any()) else z.abs()
-    return (
-        float(depths.double().quantile(FOCUS_QUANTILE))
-        if len(depths) < 1 << 24
-        else float(depths.median())
-    )
+    return float(depths.median())
 
 
 def views_to_fill(
@@ -109,11 +107,11 @@ def views_to_fill(
     """
     # The way back shows the same as the way there.
     way_there = path[: len(path) // 2 + 1]
-    step = max(1, -(-len(way_there) // FILLED_PATH_VIEWS))
+    step = math.ceil(len(way_there) / FILLED_PATH_VIEWS)
     views = [*cameras, *way_there[::step]]
 
     # Spread evenly over the photos, if there are many.
-    photo_step = max(1, -(-len(cameras) // AROUND_PHOTOS))
+    photo_step = math.ceil(len(cameras) / AROUND_PHOTOS)
     for index in range(0, len(cameras), photo_step):
         camera = cameras[index]
         at_origin = dataclasses.replace(camera, world_to_camera=torch.eye(4))
