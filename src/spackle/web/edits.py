@@ -15,15 +15,15 @@ from torch import Tensor
 from spackle.bases import DEFAULT_MAX_DISPARITY
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.image_files import OpenPicture, read_picture
 from spackle.core.trajectories import DepthRange, trajectory_cameras
-from spackle.formats.ply import encode_ply
 from spackle.formats.ply_append import append_to_ply
+from spackle.formats.ply_select import select_in_ply
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import load_scene
-from spackle.pipeline import Removal, fill, remove
+from spackle.pipeline import fill, remove
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio
+from spackle.results.mask_files import read_mask
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Reporter
@@ -36,7 +36,6 @@ FORMER_PAGE = "former.json"
 MASK_FILE = "mask.png"
 REMOVED_FILE = "removed.ply"  # among the results: the scene without a thing, before the patch
 
-WHITE_THRESHOLD = 128  # of 0..255, from which on a pixel of a mask is white
 # After a removal, so many views around the scene's camera are filled besides the present one.
 VIEWS_AROUND = 8
 # Long side of these views; finer ones would take longer, and the present one is as it is.
@@ -108,13 +107,14 @@ def remove_and_patch(
     cameras = [camera, *_views_around(loaded)]
     with reporter.stage("patch") as progress:
         removal = remove(loaded.gaussians, marked, cameras, renderer=renderer, progress=progress)
-    rest = _kept(loaded, removal)
     removed_file = target.with_name(REMOVED_FILE)
-    write_atomic(removed_file, encode_ply(rest))
-    added = removal.patched.select(slice(len(rest.gaussians), None))
+    left_rows = select_in_ply(source, removal.is_kept)
+    assert left_rows is not None  # rows of a PLY of Spackle can be taken out
+    write_atomic(removed_file, left_rows)
+    added = removal.patched.select(slice(len(removal.edited), None))
     write_atomic(target, _with_more(removed_file, added))
 
-    before = _hole_ratio(rest.gaussians, camera, renderer)
+    before = _hole_ratio(removal.edited, camera, renderer)
     after = _hole_ratio(removal.patched, camera, renderer)
     reporter.log(
         f"{loaded.path.name}: {removed_count:,} Gaussians removed, {len(added):,} added, "
@@ -129,30 +129,16 @@ def remove_and_patch(
     }
 
 
-def read_mask(path: Path, width: int, height: int) -> Tensor:
-    """The mask in a picture's file, [H, W] bool: true where it is white, and not transparent.
+def sent_mask(path: Path, camera: Camera) -> Tensor:
+    """The mask [H, W] bool that a client has sent for a camera's view.
 
-    InputError if the file is no picture, or has not `width` × `height` pixels.
+    InputError if it is no picture of the view's shape, or marks nothing or everything. The message
+    has no path of this server.
     """
-
-    def read(picture: OpenPicture) -> Tensor:
-        """The mask of an open picture."""
-        image = picture.image
-        if image.size != (width, height):
-            size = f"{image.width}×{image.height}"
-            raise InputError(f"mask: {size} pixels, but its camera has {width}×{height}")
-        bands = image.convert("LA")
-        white = torch.frombuffer(bytearray(bands.tobytes()), dtype=torch.uint8)
-        light, opaque = white.view(height, width, 2).unbind(-1)
-        return (light >= WHITE_THRESHOLD) & (opaque >= WHITE_THRESHOLD)
-
     try:
-        mask = read_picture(path, read)
+        return read_mask(path, camera, "its camera")
     except InputError as error:
         raise InputError(str(error).replace(str(path), "mask")) from error
-    if not bool(mask.any()):
-        raise InputError("mask: it marks no pixel: paint the thing white")
-    return mask
 
 
 def _with_more(source: Path, added: Gaussians) -> bytes:
@@ -160,21 +146,6 @@ def _with_more(source: Path, added: Gaussians) -> bytes:
     content = append_to_ply(source, added.with_harmonics_count(0))
     assert content is not None  # a PLY of Spackle has room for every Gaussian
     return content
-
-
-def _kept(scene: SceneFile, removal: Removal) -> SceneFile:
-    """A scene as a removal has left it, before the patch."""
-    is_kept = removal.is_kept
-    base_count = len(is_kept) if scene.base_count is None else scene.base_count
-    # `dataclasses.replace` would keep what belongs to the file alone, such as its size in bytes.
-    return SceneFile(
-        path=scene.path,
-        gaussians=removal.edited,
-        camera=scene.camera,
-        base_count=int(is_kept[:base_count].sum()),
-        disparity=scene.disparity,
-        is_metric=scene.is_metric,
-    )
 
 
 def _views_around(loaded: SceneFile) -> list[Camera]:

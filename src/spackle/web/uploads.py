@@ -23,7 +23,7 @@ from spackle.core.image_formats import (
 from spackle.depth.readers import DEPTH_SUFFIXES
 from spackle.formats.camera_files import CameraEntry, camera_from_json
 from spackle.runtime.errors import InputError, first_validation_problem, printable_line
-from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, read_mask
+from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, sent_mask
 from spackle.web.jobs import Edit, Job, Jobs
 from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions, check_photo
 
@@ -112,7 +112,8 @@ class RemovalRequest(BaseModel):
 FILL_FORM = _edit_form(FillRequest)
 MASK_FIELD = {
     **BINARY_FILE,
-    "description": "A picture of the camera's size: white, or opaque, where the thing is.",
+    "description": "A picture of the view's shape: white where the thing is, "
+    "black or transparent elsewhere.",
 }
 REMOVAL_FORM = _edit_form(RemovalRequest, mask=MASK_FIELD)
 
@@ -181,7 +182,7 @@ def accept_removal(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: J
     """Check a form with the mask of a thing in a finished scene, and queue it; returns its job.
 
     HTTPException 422 for a form without mask or camera, or with an impossible camera; 415 for a
-    mask that is no picture of the camera's size.
+    mask that is no picture of the view's shape, or that marks nothing or everything.
     """
     request = _edit_options(form, RemovalRequest)
     camera = request.camera.model_dump()
@@ -191,7 +192,7 @@ def accept_removal(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: J
         raise HTTPException(422, "send the mask as the file `mask`")
     store_upload(mask, upload_folder, MASK_FILE)
     try:
-        read_mask(upload_folder / MASK_FILE, camera["width"], camera["height"])
+        sent_mask(upload_folder / MASK_FILE, camera_from_json(camera, "camera"))
     except InputError as error:
         raise HTTPException(415, str(error)) from error
     return _add_edit(Edit("remove", parent.id, [camera], MASK_FILE), upload_folder, jobs, parent)

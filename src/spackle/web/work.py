@@ -39,8 +39,8 @@ from spackle.web.edits import (
     FORMER_PAGE,
     REMOVED_FILE,
     fill_views,
-    read_mask,
     remove_and_patch,
+    sent_mask,
 )
 from spackle.web.jobs import Job
 
@@ -203,7 +203,7 @@ class SceneWork:
         if job.mask is None:
             report = fill_views(job.folder / job.source, scene_file, cameras, renderer, reporter)
         else:
-            mask = read_mask(job.folder / job.mask, cameras[0].width, cameras[0].height)
+            mask = sent_mask(job.folder / job.mask, cameras[0])
             report = remove_and_patch(
                 job.folder / job.source, scene_file, (cameras[0], mask), renderer, reporter
             )
