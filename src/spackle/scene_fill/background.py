@@ -139,12 +139,17 @@ def find_background(
 ) -> list[ViewBackground] | None:
     """The background of each view; None if all emptiness is holes.
 
+    The other cameras are witnesses of what lies behind an empty region of a view. Where they see
+    through the space, nothing is there: background. Where surfaces hide the space from them, there
+    may be something that no camera has seen: a hole.
+
     Args:
         gaussians: the scene.
         views: the scene as its cameras see it.
     """
     if has_no_background(gaussians, views):
         return None
+    # Through each empty pixel that is asked about goes a ray, with points at these depths.
     depths = _ray_depths([view.witness for view in views])
 
     def with_backgrounds(backgrounds: Sequence[Tensor]) -> list[Witness]:
@@ -166,7 +171,7 @@ def find_background(
         answers = _ask_regions(view, cut_regions[index], others, depths)
         open_backgrounds.append(view.is_open & ~answers.is_hidden)
 
-    # Then the regions that surfaces enclose.
+    # Then the regions that surfaces enclose, with what is now known of the open ones.
     witnesses = with_backgrounds(open_backgrounds)
     result = []
     for index, view in enumerate(views):

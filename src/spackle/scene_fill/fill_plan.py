@@ -79,6 +79,7 @@ def plan_fill(
             backgrounds = backgrounds[: len(views)]
             background_ratios = [float(view.is_background.float().mean()) for view in backgrounds]
             given = [~view.is_background for view in backgrounds]
+            # What is filled in other views may appear in enclosed background, but not in the sky.
             keep_empty = [view.is_open for view in backgrounds]
 
     return FillPlan(
