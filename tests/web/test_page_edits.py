@@ -121,7 +121,9 @@ def test_what_a_person_sees_is_filled_and_undone(
 
 
 def paint(page: Any, radius: float) -> None:
-    """Paint a disc of a radius, a share of the picture's width, in its middle, stroke by stroke."""
+    """Paint a disc in the picture's middle, with a brush that reaches beyond it by 0.075 of the
+    picture's width; `radius` is a share of this width.
+    """
     box = page.locator("#mask").bounding_box()
     x, y, r = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, radius * box["width"]
     page.locator("#brush-size").fill("20")
@@ -129,7 +131,7 @@ def paint(page: Any, radius: float) -> None:
     page.mouse.down()
     for k in range(25):
         angle = 2 * math.pi * k / 12
-        share = k / 24
+        share = min(k / 12, 1)  # a turn outwards, and then a whole circle
         page.mouse.move(x + share * r * math.cos(angle), y + share * r * math.sin(angle))
     page.mouse.up()
 
@@ -146,10 +148,10 @@ def test_a_painted_thing_is_taken_out_and_put_back(
         before = seen(page)
         page.locator("#remove").click()
         assert not page.locator("#brush-go").is_enabled()
-        paint(page, 0.2)
+        paint(page, 0.095)
         page.keyboard.press("Control+z")  # the stroke
         assert not page.locator("#brush-go").is_enabled()
-        paint(page, 0.2)
+        paint(page, 0.095)
         page.keyboard.press("Escape")  # leaves all as it is
         assert not page.locator("#mask").is_visible()
         page.locator("#remove").click()
@@ -157,7 +159,7 @@ def test_a_painted_thing_is_taken_out_and_put_back(
         page.locator("#mask").hover()
         page.mouse.wheel(0, -100)
         page.wait_for_function(f"document.getElementById('brush-size').value > {size}")
-        paint(page, 0.2)
+        paint(page, 0.095)
         inside = page.locator("#brush-go").bounding_box()
         assert inside["x"] >= 0
         assert inside["x"] + inside["width"] <= screen["viewport"]["width"]

@@ -98,7 +98,12 @@ def remove_and_patch(
     camera, mask = mark
     loaded = load_scene(source)
     with reporter.stage("remove"):
-        marked = marked_gaussians(loaded.gaussians, [(camera, mask)], renderer)
+        # What an earlier fill has made up behind the thing goes with it.
+        index = torch.arange(len(loaded.gaussians))
+        base_count = len(index) if loaded.base_count is None else loaded.base_count
+        marked = marked_gaussians(
+            loaded.gaussians, [(camera, mask)], renderer, is_invented=index >= base_count
+        )
     removed_count = int(marked.sum())
     if removed_count == 0:
         raise InputError("nothing stands there: paint over the whole thing that is to go")
