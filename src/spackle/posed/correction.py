@@ -65,7 +65,9 @@ class DepthCorrection:
         `place` [N, 2] is the pixel's x and y, from 0 to 1 over the photo.
         """
         shifted = self.shifted_inverse_depth(inverse)
-        # `grid_sample` takes x, y and layer as -1..1, and repeats the border beyond it.
+        # The field has a grid over the photo for each of several depths, its layers. In between,
+        # it is interpolated: `grid_sample` takes x, y and layer as -1..1, and repeats the border
+        # beyond it.
         nearness = (shifted - self.first_layer) / (self.last_layer - self.first_layer)
         position = 2 * torch.cat([place, nearness[:, None]], dim=1) - 1  # [N, 3]
         field = self.field.to(place)[None, None]  # [1, 1, layers, rows, columns]
@@ -150,12 +152,12 @@ def fit_correction(
         if high > low:
             correction = dataclasses.replace(correction, first_layer=low, last_layer=high)
         # log(known / predicted) is what the field should be at each point.
-        missing = (known_inverse / correction.inverse_depth(inverse, place)).log()
+        known_logs = (known_inverse / correction.inverse_depth(inverse, place)).log()
         # Where each point lies between the farthest layer (0) and the nearest one (1).
         layers_range = correction.last_layer - correction.first_layer
         from_first = correction.shifted_inverse_depth(inverse) - correction.first_layer
         nearness = from_first / layers_range
-        field = _fit_field(missing, place, nearness)
+        field = _fit_field(known_logs, place, nearness)
         correction = dataclasses.replace(correction, field=field)
 
     errors = (correction.inverse_depth(inverse, place) / known_inverse - 1).abs()
@@ -200,10 +202,15 @@ def _fit_scale_and_shift(inverse: Tensor, known_inverse: Tensor) -> tuple[float,
     solution = torch.tensor([scale, 0.0], dtype=torch.float64)
     penalty = torch.diag(torch.tensor([0.0, SHIFT_PENALTY], dtype=torch.float64))
     for fit_round in range(FIT_ROUNDS):
+        # From round to round, points with large errors lose more of their weight.
         weights = _weights(columns @ solution - 1, fit_round)
         weighted = columns * weights[:, None]
+
+        # Weighted least squares of columns @ solution = 1: AᵀWA and AᵀW1. The penalty grows with
+        # the points' weight, so that its part in the result does not depend on their number.
         normal = columns.T @ weighted + penalty * weights.sum()
-        solution = torch.linalg.solve(normal, weighted.sum(0))
+        right_side = weighted.sum(0)
+        solution = torch.linalg.solve(normal, right_side)
     fitted_scale, fitted_shift = solution.tolist()
     # Depth that runs the wrong way is no depth: then the scale alone is right.
     if fitted_scale <= 0:
@@ -211,28 +218,35 @@ def _fit_scale_and_shift(inverse: Tensor, known_inverse: Tensor) -> tuple[float,
     return fitted_scale, fitted_shift * float(unit)
 
 
-def _fit_field(missing: Tensor, place: Tensor, nearness: Tensor) -> Tensor:
-    """The smooth field [layers, rows, columns] that explains known log factors.
+def _fit_field(known_logs: Tensor, place: Tensor, nearness: Tensor) -> Tensor:
+    """The smooth field [layers, rows, columns] of log factors that explains those of N points.
 
     Args:
-        missing: [N] the log factors.
-        place: [N, 2] x and y of 0..1 where they are known.
-        nearness: [N] 0 at the first layer, 1 at the last one.
+        known_logs: [N] log of the factor by which each point's inverse depth must still change.
+        place: [N, 2] x and y of the points in the photo, 0..1.
+        nearness: [N] inverse depth of the points: 0 at the first layer, 1 at the last one.
     """
+    # The field at a point is a weighted mean of its nodes: one row of `sampling`.
     layers, rows, columns = FIELD_NODES
     by_layer = _shares(nearness, layers)[:, :, None, None]
     by_row = _shares(place[:, 1], rows)[:, None, :, None]
     by_column = _shares(place[:, 0], columns)[:, None, None, :]
     sampling = (by_layer * by_row * by_column).flatten(1)  # [N, nodes]
 
-    # More points may bend the field more, but twice as many do not say twice as much.
-    weight_of_points = 1 / max(1.0, len(missing) / (rows * columns)) ** 0.5
+    # More points may bend the field more, but twice as many do not say twice as much: the weight
+    # of all together grows as the root of their number.
+    points_a_node = len(known_logs) / (rows * columns)
+    weight_of_points = 1 / max(1.0, points_a_node) ** 0.5
+
+    # Least squares, in which points with large errors lose more of their weight in each round.
     smoothness = _smoothness()
     field = torch.zeros(sampling.shape[1], dtype=torch.float64)
     for fit_round in range(FIT_ROUNDS):
-        weights = weight_of_points * _weights(sampling @ field - missing, fit_round)
+        errors = sampling @ field - known_logs
+        weights = weight_of_points * _weights(errors, fit_round)
         normal = sampling.T @ (sampling * weights[:, None])
-        field = torch.linalg.solve(normal + smoothness, sampling.T @ (weights * missing))
+        right_side = sampling.T @ (weights * known_logs)
+        field = torch.linalg.solve(normal + smoothness, right_side)
     return field.clamp(-MAX_FIELD, MAX_FIELD).reshape(FIELD_NODES)
 
 
@@ -246,9 +260,17 @@ def _shares(position: Tensor, count: int) -> Tensor:
 
 
 def _smoothness() -> Tensor:
-    """[nodes, nodes] the quadratic form by which a field costs: bends, steps and size."""
+    """[nodes, nodes] the matrix C by which a field f of log factors costs fᵀ C f.
+
+    Bends within a layer (a grid over the photo at one depth), steps and bends from layer to layer,
+    and large factors cost.
+    """
+    # The last axis of `nodes` holds, for each node, the coefficients that pick it out of a field.
+    # So a difference of neighbours in this grid holds the coefficients of that difference.
     count = math.prod(FIELD_NODES)
     nodes = torch.eye(count, dtype=torch.float64).reshape(*FIELD_NODES, count)
+
+    # Second differences down, across and along the diagonal; then those from layer to layer.
     down = nodes[:, :-2] - 2 * nodes[:, 1:-1] + nodes[:, 2:]
     across = nodes[:, :, :-2] - 2 * nodes[:, :, 1:-1] + nodes[:, :, 2:]
     twist = nodes[:, 1:, 1:] - nodes[:, 1:, :-1] - nodes[:, :-1, 1:] + nodes[:, :-1, :-1]
@@ -262,6 +284,7 @@ def _smoothness() -> Tensor:
         (LAYER_BEND_PENALTY, layer_bend),
         (SIZE_PENALTY, nodes),
     ]
+    # A difference d·f costs (d·f)² = fᵀ d dᵀ f.
     cost = torch.zeros(count, count, dtype=torch.float64)
     for weight, differences in weighted:
         rows = differences.reshape(-1, count)
@@ -291,7 +314,9 @@ def move_gaussians(
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     K = camera.K.double()
 
-    # r = z' / z at each mean. A Gaussian behind the camera, which no base makes, is only scaled.
+    # r = z' / z at each mean: the corrected depth by the old one. A Gaussian behind the camera,
+    # which no base makes, has no place in the photo; it is moved by the correction's scale alone,
+    # which is one of inverse depths, so depths are divided by it.
     with torch.enable_grad():
         points = means.clone().requires_grad_(True)
         z = points[:, 2]
@@ -305,12 +330,18 @@ def move_gaussians(
         (ratio_gradient,) = torch.autograd.grad(ratio.sum(), points)
     ratio = ratio.detach()
 
-    # x' = r(x) · x has the Jacobian r I + x ∇rᵀ, after the change of lens.
+    # A Gaussian's shape follows the map near its mean, its Jacobian. After the change of lens, the
+    # map is x' = r(x) · x, whose Jacobian is r I + x ∇rᵀ.
     identity = torch.eye(3, dtype=torch.float64)
     jacobian = ratio[:, None, None] * identity + means[:, :, None] * ratio_gradient[:, None, :]
     factor = quat_to_matrix(gaussians.quats.double()) * gaussians.scales.double()[:, None, :]
+
+    # With factor = rotation · scales, the covariance is factor · factorᵀ. The singular values of
+    # the changed factor are the new standard deviations, along the left singular vectors.
     axes, scales, _ = torch.linalg.svd(jacobian @ (lens_change @ factor))
-    # A mirrored frame of axes is no rotation; an axis may point either way.
+
+    # Axes that form a mirrored frame (determinant -1) are no rotation. An axis may point either
+    # way, so all three are turned round.
     axes = axes * torch.linalg.det(axes)[:, None, None].sign()
     dtype = gaussians.means.dtype
     return dataclasses.replace(

@@ -224,6 +224,7 @@ def _write_files(
         """Each frame of the video, as the encoder asks for it."""
         for index, camera in enumerate(scene.path):
             with torch.no_grad():
+                # One picture of each frame, or two for a stereo video.
                 renderings = [
                     renderer.render([scene.base, scene.aux], maker.resized_camera(eye))
                     for eye in maker.eyes(camera)

@@ -201,10 +201,19 @@ def complete_posed(
 def _measure(
     base: Gaussians, aux: Gaussians, path: Sequence[Camera], pipeline: Pipeline
 ) -> tuple[ViewHoles, ...]:
-    """The share of holes of views along the way there, before and after the fill."""
-    way_there = range(0, len(path) // 2 + 1, max(1, len(path) // (2 * REPORTED_VIEWS)))
+    """The share of holes in about 8 views along the path, before and after the fill.
+
+    Args:
+        base: the photos' Gaussians.
+        aux: the Gaussians that the fill has added.
+        path: the views of the video, which go through the photos and back.
+        pipeline: has the renderer.
+    """
+    # The second half of the path goes back, and shows the same as the first.
+    last = len(path) // 2
+    step = max(1, len(path) // (2 * REPORTED_VIEWS))
     holes = []
-    for index in way_there:
+    for index in range(0, last + 1, step):
         before = pipeline.renderer.render(base, path[index])
         after = pipeline.renderer.render([base, aux], path[index])
         holes.append(
@@ -349,8 +358,20 @@ def _aligned(
     source: str,
     base_name: str,
 ) -> AlignedPhoto:
-    """A photo with its Gaussians moved to known depths; without a correction they stay."""
-    unchanged = DepthCorrection(1.0, 0.0, torch.zeros(2, 2, 2, dtype=torch.float64))
+    """A photo with its Gaussians moved to known depths; without a correction they stay.
+
+    Args:
+        file: the photo's file.
+        prediction: what the base made of the photo.
+        camera: the photo's true camera, in the world, at the prediction's size.
+        found: the correction of the base's depths; None: they are measured, by a depth map.
+        source: what gave the depths, in words.
+        base_name: of the base.
+    """
+    # Factor 1, no shift, and no further factors: the logs of a field of 2×2×2 nodes, the smallest.
+    unchanged = DepthCorrection(
+        scale=1.0, shift=0.0, field=torch.zeros(2, 2, 2, dtype=torch.float64)
+    )
     correction = unchanged if found is None else found.correction
     own = move_gaussians(prediction.gaussians, correction, prediction.camera, camera)
     camera_to_world = torch.linalg.inv(camera.world_to_camera.double())

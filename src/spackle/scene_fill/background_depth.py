@@ -56,17 +56,23 @@ def background_depth(depth: Tensor, is_open: Tensor, mask: Tensor) -> Background
         is_open: [H, W] bool: pixels that show nothing, or hardly anything.
         mask: [H, W] bool, neither empty nor the whole picture.
     """
-    visible = torch.where(is_open, 0, 1 / depth.double().clamp_min(1e-30)).numpy()
+    # [H, W] inverse depth of what is visible; where nothing is, 0, as if infinitely far away.
+    visible = torch.where(is_open, 0, 1 / depth.double().clamp_min(1e-30)).numpy()  # no 1 / 0
     known = ~mask.numpy()
     rim = _rim(mask)
     on_surface = rim & ~is_open.numpy()
-    if np.count_nonzero(on_surface) < MAX_PLANES:
-        # Nothing but emptiness surrounds the mask: whatever is there is in front of it.
+    if np.count_nonzero(on_surface) < 3:  # no plane goes through fewer pixels
+        # Hardly anything but emptiness surrounds the mask, so there is emptiness behind the thing,
+        # too: inverse depth 0, without noise.
         return BackgroundDepth(torch.from_numpy(np.where(known, visible, 0)).float(), 0.0)
 
-    planes = _planes_through_rim(visible, on_surface)
-    # What the planes leave is continued as a ratio. Slits say nothing, and things in front neither.
+    # Rooms and streets consist of planes, so planes are continued behind the mask. Surfaces differ
+    # from them by a ratio of inverse depths, which is 1 on a plane; it is continued smoothly.
+    planes = _planes_through_rim(visible, on_surface)  # [H, W]
     ratio = np.where(is_open.numpy(), NOTHING, visible / planes).clip(NOTHING, 1 / NOTHING)
+
+    # Around the mask, some pixels say nothing about the background: slits between Gaussians are no
+    # sky, and what is nearer than the planes is another thing in front.
     slits = is_open & ~_without_slits(is_open)
     says_something = known & ~slits.numpy() & (ratio < NEARER_RATIO)
     filled, _ = fill_from_far_side(
@@ -75,6 +81,8 @@ def background_depth(depth: Tensor, is_open: Tensor, mask: Tensor) -> Background
     )  # fmt: skip
     behind = filled.double().numpy() * planes
 
+    # The noise is how much surfaces around the mask usually differ from the planes. The median
+    # absolute deviation is little moved by edges and by things in front.
     deviation = np.abs(np.log(ratio[on_surface]))
     regular = deviation[deviation < MAX_DEVIATION]
     noise = MAD_TO_SIGMA * float(np.median(regular)) if len(regular) else MAX_DEVIATION
@@ -117,11 +125,14 @@ def _planes_through_rim(visible: Floats, on_surface: NDArray[np.bool_]) -> Float
     if not planes:  # no plane explains enough, as in a wood
         return np.full((height, width), np.median(inverse_depth))
 
-    # A corner of a room bends towards the camera: the nearest plane is seen. An edge of a thing
-    # bends away: the farthest plane is seen. The rim says which it is, and which planes belong.
-    smallest = NOTHING * float(np.median(inverse_depth))  # beyond its horizon, a plane is not seen
+    # In a corner of a room, each wall hides how the other would go on: of the planes, the nearest
+    # is seen at each pixel. At an edge of a thing, its sides end at the edge: the farthest is seen.
+    # So all choices of planes are tried both ways, and the one that explains the rim best is taken.
+    # Each plane more must pay, or noise would be explained by planes.
+    # Beyond its horizon, the inverse depth of a plane is negative: it counts as very far away.
+    smallest = NOTHING * float(np.median(inverse_depth))
     best_error = math.inf
-    best = np.empty(0)
+    best = np.empty(0)  # replaced in the first round, whose error is finite
     for count in range(1, len(planes) + 1):
         for some in itertools.combinations(planes, count):
             for nearest in (True, False):
