@@ -618,7 +618,8 @@ def fill_as_planned(
     if not any(plan.hole_ratios):
         return gaussians
 
-    # Completion starts from a photo's camera at the world's origin.
+    # The fill works as after a photo, whose camera is the world's origin. So the scene and the
+    # views move into the world of the camera that stands for the photo, and the result back.
     to_photo = plan.photo_camera.world_to_camera.double()
     from_photo = torch.linalg.inv(to_photo)
 
@@ -638,13 +639,15 @@ def fill_as_planned(
         shipped_network() if network == "shipped" else network,
         texture=open_texture(texture),
     )
+    # The texture "none" leaves all holes open, so no view is filled.
+    views = [] if texture == "none" else [moved(camera) for camera in cameras]
     filled = fill_scene(
         context,
-        [moved(camera) for camera in cameras] if texture != "none" else (),
-        exact=True,
+        views,
+        exact=True,  # leave no hole, however small: views are given one by one, not as a path
         progress=progress,
         fillable=plan.fillable,
-        keep_empty=plan.keep_empty,
+        keep_empty=plan.keep_empty,  # such as sky, in which nothing may appear
         guarded_views=MAX_GUARDED_VIEWS,
     )
     return Gaussians.cat([gaussians, filled.aux.transform(from_photo)])

@@ -325,10 +325,15 @@ def _read_nerfstudio(path: Path, content: Any) -> CameraSet:
             exclude={"file_path", "transform_matrix"}, exclude_unset=True, exclude_none=True
         )
         K, width, height = _nerf_lens(_NerfLens(**lens), path.parent / frame.file_path, where)
+
+        # [4, 4] from the camera to the world. nerfstudio first moves the scene, then scales it:
+        # the scale changes where a camera stands, and not where it looks.
         pose = _four_rows(frame.transform_matrix)
         if dataparser is not None:
             pose = _four_rows(dataparser.transform) @ pose
             pose[:3, 3] *= dataparser.scale
+
+        # These programs' cameras have OpenGL's axes: y up, and looking along -z.
         cameras.append(_camera(K, pose @ OPENGL_TO_OPENCV, width, height, where))
 
     if any(_has_distortion(lens) for lens in (file, *file.frames)):
@@ -338,7 +343,7 @@ def _read_nerfstudio(path: Path, content: Any) -> CameraSet:
         kind="nerfstudio",
         cameras=tuple(cameras),
         names=tuple(frame.file_path for frame in file.frames),
-        origin=OPENGL_TO_OPENCV,
+        origin=OPENGL_TO_OPENCV,  # of a photo without a camera: at the world's origin, along -z
         notes=tuple(notes),
     )
 

@@ -275,11 +275,18 @@ def _orbit(scene: SceneFile, up: str) -> FillViews:
 
 
 def _middle_and_radius(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """The middle [3], float64, of a scene, and the distance from it within which 95 % of it lie."""
+    """The middle [3] of a scene, float64, and the radius around it with 95 % of its Gaussians.
+
+    Both in the scene's unit.
+    """
+    # Faint Gaussians say nothing about where the scene is, unless all are faint.
     means = gaussians.means[gaussians.opacities >= MIN_ORBIT_OPACITY].double()
     if not len(means):
         means = gaussians.means.double()
+
+    # The median and the quantile are not moved by stray Gaussians far away.
     middle = means.median(dim=0).values
     distances = (means - middle).norm(dim=1)
     rank = max(1, round(ORBIT_QUANTILE * len(distances)))
-    return middle, max(float(distances.kthvalue(rank).values), 1e-6)
+    radius = float(distances.kthvalue(rank).values)
+    return middle, max(radius, 1e-6)  # above 0, even if all lie in one point

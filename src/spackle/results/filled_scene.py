@@ -103,9 +103,13 @@ def _mean(ratios: Sequence[float]) -> float:
 def _hole_ratios(
     gaussians: Gaussians, cameras: Sequence[Camera], plan: FillPlan, renderer: Renderer
 ) -> list[float]:
-    """The share of each view's pixels that are still holes, 0..1; background is none."""
+    """The share of each view's pixels that are still holes, 0..1.
+
+    Emptiness that the plan keeps as background, such as sky, is no hole.
+    """
     ratios = []
     for index, camera in enumerate(cameras):
+        # [H, W] bool: the pixels that were to be filled; None: all.
         pixels = None if plan.fillable is None else plan.fillable[index]
         alpha = renderer.render(gaussians, camera).alpha
         ratios.append(fillable_hole_ratio(alpha, pixels))

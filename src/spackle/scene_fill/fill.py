@@ -165,6 +165,7 @@ class _SceneFilling:
             keep_empty: for each view the pixels [H, W] bool in which nothing may appear.
             guarded_views: so many of the widest views protect their surfaces from the start.
         """
+        # What is to be done.
         self.context = context
         self.cameras = cameras
         self.fillable = fillable
@@ -172,22 +173,26 @@ class _SceneFilling:
         self.exact = exact
         self.max_hole_ratio = 0.0 if exact else INVISIBLE_HOLE_RATIO
 
+        # The order of the visits: the widest views first, which are those that differ most.
         photo_camera = context.photo_camera
         differences = view_differences([*cameras, photo_camera], photo_camera, context.near_depth)
         self.order = farthest_first(differences)
         self.differences = differences[:-1, :-1]  # [V, V], between the views alone
-        # [V] whether a visited view shows the same.
+        # [V] bool: views that need no visit, because a visited view shows the same.
         self.is_settled = torch.zeros(len(cameras), dtype=torch.bool)
 
-        # No new Gaussian may hide what the photo or one of the widest views shows.
+        # No new Gaussian may hide what the photo or one of the widest views shows: each of them has
+        # a guard. The key is the view's index; PHOTO stands for the photo's own view.
         self.renderer = IncrementalRenderer(context.renderer, context.base)
-        self.guards = {PHOTO: context.photo_guard()}  # by the view's index; PHOTO: the photo's
-        # Renderings of the base alone, by the view's index; dropped when the view is visited.
+        self.guards = {PHOTO: context.photo_guard()}
+
+        # The guards' renderings of the base alone, by the view's index, are kept until the view is
+        # visited, but not more than by default: renderings take much memory.
         self.base_renderings: dict[int, Rendering] = {}
         for position, index in enumerate(self.order[:guarded_views]):
             rendering = self.renderer.render(cameras[index])
             self.guards[index] = self._guard(index, rendering)
-            if position < GUARDED_VIEWS:  # of more views, renderings would take much memory
+            if position < GUARDED_VIEWS:
                 self.base_renderings[index] = rendering
 
         self.filled_views = 0
@@ -207,7 +212,9 @@ class _SceneFilling:
 
     def visit(self, index: int) -> None:
         """Render a view with everything added so far, and fill its holes if they are visible."""
-        self.is_settled |= self.differences[index] < MIN_VIEW_DIFFERENCE
+        # Views that show the same as this one need no visit any more.
+        self.is_settled |= self.differences[index] < MIN_VIEW_DIFFERENCE  # [V]
+
         camera = self.cameras[index]
         base_rendering = self.base_renderings.pop(index, None)  # no longer needed afterwards
         rendering = self.renderer.render(camera, base_rendering)
@@ -224,17 +231,20 @@ class _SceneFilling:
             camera,
             self._other_guards(index),
             max_hole_ratio=self.max_hole_ratio,
-            with_underlays=len(self.cameras) > 1,  # a single view shows nothing beneath its rims
+            # Underlays are Gaussians beneath the rims of holes, for other views; a single view
+            # shows nothing there.
+            with_underlays=len(self.cameras) > 1,
             fillable=fillable,
         )
         self.aux += filled.aux
         self.pending_underlays += [(index, underlay) for underlay in filled.underlays]
         self.filled_views += 1
+        # Later Gaussians must not hide what this view shows now.
         self.guards[index] = self._guard(index, filled.rendering)
         self.pictures.clear()  # the added Gaussians may appear in them
 
-        # The two widest views show nearly all holes. When they are filled, what lies beneath the
-        # rims of their holes is known.
+        # The two widest views, the first ones in the order, show nearly all holes. When they are
+        # filled, what lies beneath the rims of their holes is known.
         if self.filled_views >= OPPOSITE_VIEWS:
             underlays = self._place_underlays()
             self.renderer.add(*underlays)

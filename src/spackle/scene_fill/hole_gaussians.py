@@ -81,8 +81,9 @@ def fill_holes(
     deltas = view.deltas(context.network, context.precision, cells=mask)
     cells = view.gaussians(mask, deltas)
 
-    # Gaussians that would hide a guarded surface move away along their line of sight. A single cell
-    # that stayed near, between others that moved, would look like a speck, so it moves like them.
+    # Gaussians that would hide a surface that another view shows (a guard) move away along their
+    # line of sight. A single cell that stayed near, between others that moved, would look like a
+    # speck (a "pit" of the depths), so it moves like them. A scale of 0 removes a Gaussian.
     depths = view.camera.to_camera(cells.means)[:, 2]
     scales = unoccluding_scales(cells, eye, guards)
     moved_depths = depths * scales
@@ -91,16 +92,18 @@ def fill_holes(
 
     pixels = Gaussians.empty()
     if context.texture is not None:
-        # The smooth colours of all cells: the new Gaussians' in holes, the rendered ones elsewhere.
-        # Holes that are not to be filled have their first guess, lest black bleeds out of them.
+        # The texture adds detail to smooth colours of all cells: those of the new Gaussians in
+        # holes, the rendered ones elsewhere. Other holes, which are not to be filled, were rendered
+        # black, and the texture would spread that. So they get the colours of the initial
+        # Gaussians, the first guess from what surrounds them.
         structure = view.features.rgb.clone()
         structure[view.mask] = view.initial.rgb[view.mask]
         structure[mask] = linear_to_srgb(cells.colors)
         picture = context.texture(view, structure)
         pixels = _textured_pixels(view, mask, deltas, picture, scales)
 
-        # A cell's own Gaussian lies a little behind the Gaussians of its pixels, and has their mean
-        # colour. So it shows only where they leave gaps.
+        # A cell's own Gaussian lies a little behind the Gaussians of its pixels (so far that it
+        # does not show through them), and has their mean colour. So it shows only in gaps.
         scales = scales / (1 - BEHIND_SURFACE_RATIO)
         cell_pixels = group_by_cell(picture)[mask]
         linear_means = srgb_to_linear(cell_pixels.clamp(0, 1)).mean((1, 2))
