@@ -38,7 +38,7 @@ def match_depths(
     Args:
         pictures: [H, W, 3] sRGB of all photos.
         cameras: of the photos, in the world, at the size that their file states.
-        index: of the photo.
+        index: of the photo in these lists.
         target: the photo's camera in whose pixels the result is.
     """
     neighbours = _nearest(cameras, index)
@@ -47,16 +47,20 @@ def match_depths(
     if not len(uv) or not neighbours:
         return KnownDepths(torch.zeros(0, 2), torch.zeros(0))
 
-    # Steps of equal movement in the neighbour that moves most, from infinity to the nearest.
-    widest = max(float((cameras[n].position - cameras[index].position).norm()) for n in neighbours)
-    nearest_inverse = MAX_SHIFT * camera.width / (camera.focal[0] * widest)
+    # A point of inverse depth q moves by focal · baseline · q pixels to another photo, whose eye
+    # is a baseline away. So equal steps of q, from infinity to the nearest thing, are equal
+    # movements; the nearest thing moves by MAX_SHIFT in the neighbour that is farthest away.
+    baselines = [float((cameras[n].position - cameras[index].position).norm()) for n in neighbours]
+    nearest_inverse = MAX_SHIFT * camera.width / (camera.focal[0] * max(baselines))
     inverse_depths = nearest_inverse * (torch.arange(STEPS) + 0.5) / STEPS  # [S]
 
+    # A neighbour from which a patch is hidden must not spoil it, so the two best ones decide.
     scores = []
     for neighbour in neighbours:
         other_gray, other_camera = _at_working_size(pictures[neighbour], cameras[neighbour])
         scores.append(_similarities(gray, camera, other_gray, other_camera, uv, inverse_depths))
-    best_of_neighbours = torch.stack(scores).topk(min(2, len(scores)), dim=0).values.mean(0)
+    all_scores = torch.stack(scores)  # [neighbours, N, S]
+    best_of_neighbours = all_scores.topk(min(2, len(scores)), dim=0).values.mean(0)  # [N, S]
     is_clear, inverse = _clear_maxima(best_of_neighbours, inverse_depths)
 
     to_target = torch.tensor([target.width / camera.width, target.height / camera.height])
@@ -69,6 +73,8 @@ def _nearest(cameras: Sequence[Camera], index: int) -> list[int]:
     candidates = []
     for other, camera in enumerate(cameras):
         distance = float((camera.position - own.position).norm())
+        # Row 2 of the rotation is the direction in which a camera looks, so this is the cosine of
+        # the angle between the two.
         agreement = float(camera.world_to_camera[2, :3] @ own.world_to_camera[2, :3])
         if other != index and distance > 0 and agreement > 0.5:  # up to 60 degrees apart
             candidates.append((distance, other))

@@ -63,14 +63,14 @@ def merge_photos(photos: Sequence[PlacedPhoto], renderer: Renderer) -> Union:
     """Merge photos: a Gaussian is kept where its own photo sees the surface best.
 
     It is left out where another photo sees the same surface better, or sees through it: there,
-    that photo's own surface is farther away. What the remaining Gaussians leave open in a photo
-    that had covered it is taken back, so that merging makes no holes.
+    that photo's own surface is farther away. Where this opens holes in a photo that had none, the
+    photo's own Gaussians are put back, so that merging makes no holes.
 
     Args:
         photos: in the order of their rank: among equally good ones, the first decides.
         renderer: draws the merged scene.
     """
-    kept: list[Tensor] = []
+    kept: list[Tensor] = []  # [N] bool for each photo
     doubled = 0
     contradicted = 0
     for rank, photo in enumerate(photos):
@@ -82,6 +82,9 @@ def merge_photos(photos: Sequence[PlacedPhoto], renderer: Renderer) -> Union:
                 continue
             view = evidence_of(photo, other)
             is_contradicted |= view.sees_through
+
+            # The cost grows with the rank, so that a later photo replaces an earlier one only if it
+            # sees much better. Else the two would mix where they are about equally good.
             other_cost = _cost(other.camera, photo.gaussians.means, other_rank)
             is_doubled |= view.same_surface & (other_cost < own_cost)
         kept.append(~(is_doubled | is_contradicted))
@@ -125,18 +128,24 @@ def evidence_of(photo: PlacedPhoto, other: PlacedPhoto) -> Evidence:
     tolerance = _tolerance(photo, other)
     nearest, farthest = _depth_bounds(other)
     eye = photo.camera.position
-    rays = photo.gaussians.means - eye
+    rays = photo.gaussians.means - eye  # [N, 3]
     same_surface = torch.zeros(len(rays), dtype=torch.bool)
     sees_through = torch.ones(len(rays), dtype=torch.bool)
     surface_row = torch.zeros(len(rays), dtype=torch.long)
     surface_column = surface_row.clone()
+
+    # Several places on the piece are tried: the Gaussian's own, then nearer and farther ones.
     for step in PIECE_STEPS:
         uv, z = other.camera.project(eye + (1 + step * tolerance) * rays)
         is_inside, row, column = _pixels(uv, z, other.camera)
         knows = is_inside & (other.alpha[row, column] >= MIN_ALPHA)
+        # At an edge, a pixel may show either of two surfaces: a point before both lies before, one
+        # behind both lies behind.
         lies_before = z < nearest[row, column] * (1 - tolerance)
         lies_behind = z > farthest[row, column] * (1 + tolerance)
         is_same = knows & ~lies_before & ~lies_behind
+
+        # The pixel in which the other photo sees the surface is that of the first place that fits.
         is_first = is_same & ~same_surface
         surface_row = row.where(is_first, surface_row)
         surface_column = column.where(is_first, surface_column)

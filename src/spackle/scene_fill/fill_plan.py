@@ -115,17 +115,21 @@ def choose_reference(views: Sequence[ViewEmptiness]) -> int:
         for index, view in enumerate(views)
         if view.empty_ratio <= fewest + SIMILAR_EMPTY_RATIO
     ]
+
+    # What differs between two views depends on how near the scene is: as near as the nearest
+    # surfaces in the view that sees most. Views that see nothing are told apart with any depth.
     best = min(views, key=lambda view: view.empty_ratio)
     surface_depths = best.witness.depth[best.witness.depth > 0].numpy()
     near_depth = float(np.quantile(surface_depths, NEAR_QUANTILE)) if len(surface_depths) else 1.0
     cameras = [view.camera for view in views]
-    # How much a view differs from all others, rounded so that the order of a sum does not matter.
+    # [V] how much a view differs from all others together: the most central one differs least.
     totals = view_differences(cameras, best.camera, near_depth).sum(1)
 
     def rank(index: int) -> tuple[float, float, list[float]]:
         """What is smallest for the reference: of equal views, the smallest numbers of the pose."""
         view = views[index]
         pose = view.camera.world_to_camera.flatten().tolist()
+        # Rounded, so that the order in which the differences were added up does not matter.
         return (round(float(totals[index]), 6), view.empty_ratio, pose)
 
     return min(candidates, key=rank)
