@@ -116,6 +116,9 @@ def uncovered_pixels(
     for camera, was_open in zip(cameras, holes_before, strict=True):
         opened = hole_mask(renderer.render(after, camera).alpha).cpu() & ~was_open
         if not has_background and not bool(opened.all()):
+            # 1 where nothing was, 0 where something was, continued smoothly from around the new
+            # holes into them. Only these values matter, so they stand in for the depth, too; with a
+            # far bias of 0, all sides count alike.
             openness = was_open.float()
             _, continued = fill_from_far_side(openness, openness[None], ~opened, far_bias=0.0)
             opened &= continued[0] < 0.5  # nearer to something than to nothing
@@ -129,26 +132,46 @@ def _votes(
     """[N] bool three times: the Gaussians that a mask marks, those that its camera sees elsewhere,
     and those with their centres in the mask.
 
-    A Gaussian that lies outside of the camera's frame, or in the mask but not in front, is neither.
+    A Gaussian that lies outside of the camera's frame, or in the mask but not in front, is neither
+    marked nor seen elsewhere.
+
+    Args:
+        gaussians: N Gaussians, on the renderer's device.
+        camera: of the mask.
+        mask: [H, W] bool, true on the thing.
+        renderer: renders the scene.
+
+    Raises:
+        ValueError: the mask marks no pixel.
     """
     if not bool(mask.any()):
         raise ValueError("a mask marks no pixel")
     with torch.no_grad():
         rendering = renderer.render(gaussians, camera).to(torch.device("cpu"))
+
+    # Even a mask that follows the outline cuts Gaussians there in two, so it is widened a little.
     fringe_px = round(FRINGE_RATIO * math.hypot(camera.width, camera.height))
-    # Even a mask that follows the outline cuts Gaussians there in two.
     wide_mask = maximum_filter(mask, max(1, fringe_px))
+
+    # The pixels of the mask that are in front of the background by the margin, a ratio of depths.
     thing, background, margin = _thing_in_picture(rendering, wide_mask)
+
+    # The thing goes on where depth does not tell it from the background: in the fringe, over which
+    # its colour reaches, and at its foot, where it touches what it stands on. For what is visible,
+    # the foot begins where the thing is less than twice the margin in front; for what is hidden,
+    # which must also have the thing's colour, where it is as near as things that touch.
     fringe = maximum_filter(thing, fringe_px) & wide_mask & ~thing
     fringe |= _foot(thing, rendering, background, margin, 2 * margin) & wide_mask & ~thing
     contact = _foot(thing, rendering, background, margin, CONTACT_RATIO)
+
+    # A poster on a wall is nowhere in front of the wall. Then all that the mask shows is the thing.
     surface_margin = margin
     if not _tells_thing(thing | fringe, mask):
         fringe = mask
         contact = mask
         surface_margin = CONTACT_RATIO
 
-    # Each Gaussian's place in the picture.
+    # Each Gaussian's place in the picture, as the index of its pixel, row by row.
     means = gaussians.means.cpu().double()
     uv, z = camera.to("cpu", torch.float64).project(means)
     column = uv[:, 0].floor()
@@ -172,18 +195,21 @@ def _votes(
     )
     is_visible = shown > MIN_VISIBLE_PX
     mostly_in_thing = shown_in_thing > MIN_SHARE * shown
+
     # The surface of the background shines through a thing a little, but lies behind its surface.
     on_surface = z < at_center(rendering.depth) * (1 + surface_margin)
     is_own = is_visible & mostly_in_thing & (in_front | on_surface)
     is_inner = ~is_visible & is_masked & in_front
+
     # Beneath the surface of a thing often lies a second layer of it, which where the thing stands
     # on a floor is no longer in front of the floor. There, the colour tells it from the floor.
     is_contact = is_masked & at_center(contact)
-    is_near_floor = z * at_center(background) < 1 + CONTACT_RATIO
+    is_near_floor = z * at_center(background) < 1 + CONTACT_RATIO  # its depth by the floor's
     has_color = _has_color_of_thing(gaussians, index, rendering, wide_mask)
     is_layer = ~is_visible & is_contact & is_near_floor & has_color
     is_marked = is_own | is_inner | is_layer
 
+    # What this camera sees outside of its mask is not the thing, whatever other masks say.
     is_refused = is_inside & ~is_masked & ~is_marked
     return is_marked, is_refused, is_masked
 
@@ -200,12 +226,18 @@ def _has_color_of_thing(
         rendering: the view.
         wide_mask: [H, W] bool.
     """
-    shown = rendering.rgb.flatten(0, 1)[index]  # [N, 3]
+    # If nothing is around the mask, there is no other colour to which a Gaussian could belong.
     if bool(wide_mask.all()):
         return torch.ones_like(index, dtype=torch.bool)
-    flat = torch.ones(wide_mask.shape)  # all colours around the mask count alike
+
+    # The thing's colour is what the view shows at a Gaussian's place. The background's is continued
+    # into the mask from around it; with equal depths, all of what is around counts alike.
+    shown = rendering.rgb.flatten(0, 1)[index]  # [N, 3]
+    flat = torch.ones(wide_mask.shape)
     _, around = fill_from_far_side(flat, rendering.rgb.movedim(-1, 0), ~wide_mask, far_bias=0.0)
     around_there = around.movedim(0, -1).flatten(0, 1)[index]  # [N, 3]
+
+    # Clearly nearer: a Gaussian between the two colours stays.
     own = linear_to_srgb(gaussians.colors.cpu())
     from_thing = (own - shown).norm(dim=-1)
     from_around = (own - around_there).norm(dim=-1)
