@@ -78,7 +78,7 @@ class Witness:
 
     @staticmethod
     def of(camera: Camera, depth: Tensor, is_open: Tensor) -> Witness:
-        """Every n-th pixel of a view.
+        """The witness of a view: every n-th of its rows and columns.
 
         Args:
             camera: of the view.
@@ -89,6 +89,9 @@ class Witness:
         step = every.step
         small_depth = depth[every, every].double()
         height, width = small_depth.shape
+
+        # Each small pixel stands for a block of step×step pixels. The last blocks may reach over
+        # the picture or end before it, so the frame is first made to consist of whole blocks.
         blocks = camera.to("cpu", torch.float64).cropped(0, 0, width * step, height * step)
         return Witness(blocks.resized(width, height), small_depth, is_open[every, every])
 
@@ -111,7 +114,8 @@ class ViewEmptiness:
         is_open = _open_to_border(is_empty)
         depth = torch.where(is_empty, 0, rendering.depth)
 
-        # Of the nearest surface pixel; negative if there is no surface in the view.
+        # [2, H, W] row and column of the surface pixel that is nearest in the picture. Both are
+        # negative if the view shows no surface; then the depth 0 of the first pixel is taken.
         nearest = torch.from_numpy(nearest_known_pixels(is_empty.numpy())).long()
         row, column = nearest.clamp_min(0)
         nothing_known = torch.zeros_like(is_empty)
@@ -282,7 +286,9 @@ def _ask_regions(
     if not len(pixels):
         return RegionAnswers(*(torch.zeros_like(mask) for _ in range(3)))
 
-    # Some pixels of each region, evenly among its pixels in the order of its label.
+    # Some pixels of each region, evenly among its pixels. First all pixels are put in the order of
+    # their regions; a pixel's rank is its place among those of its region; then every stride-th
+    # rank is asked, from the middle of the first stride.
     pixels = pixels[regions[pixels].argsort(stable=True)]
     sizes = regions.bincount()
     first_places = sizes[1:].cumsum(0) - sizes[1:]  # of the regions 1, 2, … in `pixels`
@@ -350,16 +356,20 @@ def _ask_rays(
         clear_count += is_open
         unsure_count += is_inside & ~shows_surface & ~is_open
 
+    # A point of which too few witnesses know is neither hidden nor clear. A share of 0 / 0 is NaN,
+    # which compares as false.
     known_count = hidden_count + clear_count
     is_known = known_count >= max(1, min(MIN_WITNESSES, len(witnesses)))
-    hidden_share = hidden_count / (known_count + UNSURE_WEIGHT * unsure_count)  # NaN if 0 / 0
+    hidden_share = hidden_count / (known_count + UNSURE_WEIGHT * unsure_count)
     is_hidden = is_known & (hidden_share >= HIDDEN_SHARE)
 
     # Before the rim there is nothing, as the view itself shows.
     is_behind_rim = z_of_points > BEHIND_RIM_RATIO * rim_depth
     hidden = is_hidden & is_behind_rim
     clear = is_known & ~is_hidden & is_behind_rim
-    # From 1 on, in the order of the depths; 0 if there is none.
+
+    # The numbers of the last hidden and the last clear point of each ray: from 1 on, in the order
+    # of the depths; 0 if there is none.
     numbers = torch.arange(1, len(depths) + 1)[:, None]
     last_hidden = (numbers * hidden).amax(0)
     last_clear = (numbers * clear).amax(0)
