@@ -4,8 +4,9 @@
 
 Each scene is made of rectangles, of which some parts are missing (tests/helpers/open_scenes.py). A
 pixel that only the whole scene covers is a hole; one that it leaves empty, too, is background. The
-numbers of `scene_fill/background.py` were chosen on the default scenes of that file; these are
-others.
+numbers of `scene_fill/background.py` were chosen on the default scenes of that file. The rules for
+regions that one side of the picture cuts, and for specks, were made after a look at the scenes
+here, so this is no independent test of them.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ RENDERER = CpuRenderer()
 
 
 def scenes() -> dict[str, OpenScene]:
-    """The scenes on which nothing was chosen, by what the table calls them."""
+    """Other scenes than those of the numbers' choice, by what the table calls them."""
     return {
         "cup, 7 views": cup(count=7, height=0.4),
         "chair, 16 views from low": chair(count=16, height=0.5, hole=0.16),
