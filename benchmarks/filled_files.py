@@ -12,7 +12,7 @@ holes         mean share of hole pixels in the path's leftmost and rightmost vie
               Gaussians, filled from the file, and filled by `predict` from the photo
 file's rows   "same bytes": the file's own rows are unchanged in the filled PLY; else the largest
               difference of any value, relative to the largest of its column, after the file was
-              written anew in its format
+              written anew in its format (compressed PLYs are also sorted anew)
 photo's view  PSNR in dB at the photo's camera, harmonics included, of the filled file against the
               file ("same": no pixel differs)
 colour        the same, without the harmonics against the file with them: what would be lost
@@ -142,6 +142,9 @@ def compared_rows(source: Path, filled: Path) -> str:
     if source.name.endswith(".ply") and not source.name.endswith(".compressed.ply"):
         is_same = row_bytes(filled).startswith(row_bytes(source))
         return "same bytes" if is_same else "DIFFERENT BYTES"
+
+    if source.name.endswith(".compressed.ply"):
+        return "sorted anew"  # a compressed PLY is sorted in space, the file's Gaussians first
 
     own = load_scene(source).gaussians
     again = load_scene(filled).gaussians.select(slice(0, len(own)))
