@@ -102,7 +102,9 @@ def saved_files(scene: Path, folder: Path, splat_transform: str | None) -> Itera
         return
     for suffix in (".ply", ".compressed.ply", ".spz", ".sog"):
         copy = folder / f"splat-transform{suffix}"
-        command = [*shlex.split(splat_transform), "-q", "-w", "-g", "cpu", str(scene), str(copy)]
+        # One round of clustering of a SOG's harmonics, which would take many minutes on a processor.
+        command = [*shlex.split(splat_transform), "-q", "-w", "-g", "cpu", "-i", "1"]
+        command += [str(scene), str(copy)]
         subprocess.run(command, check=True, capture_output=True)
         yield copy
 
