@@ -88,6 +88,20 @@ def test_a_room_and_a_photo_have_no_background() -> None:
         assert hole + sky == pytest.approx(empty)
 
 
+def test_a_photos_scene_has_no_background_after_somebody_deleted_a_thing_in_its_middle() -> None:
+    photo = box_before_wall(width=64, height=48, focal=54)
+    cameras = [photo.camera, *(shifted(photo.camera, x) for x in (0.5, -0.5))]
+    base = photo.base()
+    edited = base.select(base.means[:, 2] > 4)  # without the box, which covers the wall
+    holes = hole_mask(RENDERER.render(edited, photo.camera).alpha)
+    assert 0.05 < float(holes.float().mean()) < 0.5
+
+    assert plan_fill(edited, cameras, RENDERER).fillable is None
+    # Where something is cut off at the border, the emptiness there may be background.
+    cut = base.select(base.means[:, 0] > -0.5)
+    assert plan_fill(cut, cameras, RENDERER).fillable is not None
+
+
 def test_cameras_that_stand_close_together_fill_what_surfaces_enclose() -> None:
     scene = table()
     near = scene.cameras[0]

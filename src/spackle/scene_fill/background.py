@@ -128,6 +128,11 @@ class ViewEmptiness:
         """The fraction of pixels that are empty, 0..1."""
         return float(self.is_empty.float().mean())
 
+    @property
+    def open_ratio(self) -> float:
+        """The fraction of pixels that are empty and open to the picture's border, 0..1."""
+        return float(self.is_open.float().mean())
+
 
 @dataclasses.dataclass(frozen=True)
 class ViewBackground:
@@ -188,7 +193,7 @@ def find_background(
 
 def has_no_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> bool:
     """Whether all emptiness is a hole: half of the views have none, or one shows the whole scene
-    without any.
+    without any at its border.
 
     Such a scene is a room, or was made from a photo, which has a surface in each pixel.
     """
@@ -196,8 +201,12 @@ def has_no_background(gaussians: Gaussians, views: Sequence[ViewEmptiness]) -> b
     closed_views = [view for view in views if view.empty_ratio <= CLOSED_VIEW_RATIO]
     if 2 * len(closed_views) >= len(views):
         return True
+    # In a photo's scene from which somebody has deleted something, the photo's own view has holes,
+    # but surfaces enclose them.
     return any(
-        _share_in_frame(gaussians, view.camera) >= WHOLE_SCENE_SHARE for view in closed_views
+        view.open_ratio <= CLOSED_VIEW_RATIO
+        and _share_in_frame(gaussians, view.camera) >= WHOLE_SCENE_SHARE
+        for view in views
     )
 
 
