@@ -1,7 +1,7 @@
 """Fill a scene from its file alone, as other programs save it, and compare with `predict`.
 
     python benchmarks/filled_files.py PHOTO[,DEPTH] ... [--splat-transform "npx splat-transform"]
-        [--views 9] [--depth-kind KIND] [-o rows.json]
+        [--views 9] [-o rows.json]
 
 A photo's base is saved with made-up spherical harmonics of degree 3: by Spackle, by gsply
 (`pip install gsply`, if it is installed) and by PlayCanvas's splat-transform (if a command is
@@ -69,12 +69,9 @@ class Row:
     seconds: float
 
 
-def complete(photo: Path, depth: Path | None, depth_kind: str | None) -> CompletedPhoto:
+def complete(photo: Path, depth: Path | None) -> CompletedPhoto:
     """A photo's scene as `spackle predict` makes it."""
-    base = BaseSettings(depth=depth)
-    if depth_kind is not None:
-        base = dataclasses.replace(base, depth_kind=depth_kind)
-    pipeline = Pipeline.open(PipelineOptions(base=base))
+    pipeline = Pipeline.open(PipelineOptions(base=BaseSettings(depth=depth)))
     return pipeline.complete(load_photo(photo), Reporter())
 
 
@@ -93,7 +90,7 @@ def saved_files(scene: Path, folder: Path, splat_transform: str | None) -> Itera
     """The scene's file, and copies of it that other programs wrote."""
     yield scene
     if importlib.util.find_spec("gsply") is not None:
-        import gsply  # type: ignore[import-not-found]
+        import gsply
 
         copy = folder / "gsply.ply"
         gsply.plywrite(str(copy), gsply.plyread(str(scene)))
@@ -102,7 +99,7 @@ def saved_files(scene: Path, folder: Path, splat_transform: str | None) -> Itera
         return
     for suffix in (".ply", ".compressed.ply", ".spz", ".sog"):
         copy = folder / f"splat-transform{suffix}"
-        # One round of clustering of a SOG's harmonics, which would take many minutes on a processor.
+        # One round of clustering of harmonics for a SOG, because a round takes minutes.
         command = [*shlex.split(splat_transform), "-q", "-w", "-g", "cpu", "-i", "1"]
         command += [str(scene), str(copy)]
         subprocess.run(command, check=True, capture_output=True)
@@ -194,7 +191,7 @@ def measure(
 
 def rows_of(photo: Path, depth: Path | None, options: argparse.Namespace) -> list[Row]:
     """The rows of one photo."""
-    completed = complete(photo, depth, options.depth_kind)
+    completed = complete(photo, depth)
     scene = completed.scene
     prediction = completed.predicted.prediction
     disparity = prediction.max_disparity
@@ -246,7 +243,6 @@ def main() -> None:
     parser.add_argument("photos", nargs="+", metavar="PHOTO[,DEPTH]")
     parser.add_argument("--splat-transform", metavar="COMMAND")
     parser.add_argument("--views", type=int, default=9, help="views along the path")
-    parser.add_argument("--depth-kind")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
 

@@ -26,6 +26,7 @@ import numpy as np
 import rendered_scenes
 import torch
 from PIL import Image
+from ray_tracer import ELLIPSOID
 from torch import Tensor
 
 import spackle
@@ -95,7 +96,7 @@ def make_case(make: Callable[[], rendered_scenes.Scene]) -> Case:
     center = rendered_scenes.nod(scene.pitch).T @ in_camera
     # Without a shadow, so that the ball changes nothing but what it hides.
     scene.add(
-        rendered_scenes.ELLIPSOID, center, (radius,) * 3,
+        ELLIPSOID, center, (radius,) * 3,
         rendered_scenes.Look("paint", rendered_scenes.RED), casts=False,
     )  # fmt: skip
     rgb, depth = read_view(scene, np.zeros(3))
@@ -155,7 +156,8 @@ def measure(
             if features is not None:
                 distances.append(hole_distance(features, picture, view.rgb, hole))
         distance = sum(distances) / len(distances) if distances else math.nan
-        matched = agreement(*case.views[1:], views[1:], opened[1:])
+        left, right = case.views[1:]
+        matched = agreement(left, right, views[1:], opened[1:])
         results[name] = [distance, sum(psnrs) / len(psnrs), matched]
     shown = [[view.rgb for view in before], [view.rgb for view in edited]]
     return results, [*shown, *pictures.values(), [view.rgb for view in case.views]]

@@ -151,11 +151,11 @@ def _index_of(cameras: CameraSet, name: str) -> int:
     if name.isdecimal() and int(name) < len(cameras.cameras):
         return int(name)
     suggestion = closest_name(name, [known for known in cameras.names if known])
-    question = "" if suggestion is None else f": did you mean {suggestion}?"
+    question = "" if suggestion is None else f"did you mean {suggestion}? Else "
     last = len(cameras.cameras) - 1
     raise InputError(
-        f"{cameras.source}: has no camera {name}{question} "
-        f"Give a picture's name, or a number from 0 to {last}"
+        f"{cameras.source}: has no camera {name}: {question}give a picture's name, "
+        f"or a number from 0 to {last}"
     )
 
 
