@@ -112,7 +112,7 @@ def test_options_that_cannot_be(place: Path, command: str, options: str, says: s
 
 
 def test_an_input_has_to_be_named(tmp_path: Path) -> None:
-    refuses(run("predict"), "PHOTO")
+    refuses(run("predict"), "no photo: give photos, folders of photos, one clip, or --posed FOLDER")
     refuses(run("render", "-o", tmp_path / "out"), "SCENE")
     refuses(
         run("render", tmp_path / "missing.ply", "-o", tmp_path / "out"), tmp_path / "missing.ply"

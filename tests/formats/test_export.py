@@ -194,7 +194,7 @@ def test_one_gaussian_and_none(kind: str) -> None:
         encode(kind, dataclasses.replace(one, scales=one.scales * math.nan))
 
 
-def test_glb_keeps_the_photos_camera_and_the_border() -> None:
+def test_glb_and_ply_keep_the_photos_camera_and_the_border(tmp_path: Path) -> None:
     lens = Camera.from_focal(50, 64, 48)
     camera = lens.looking(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.5, 4.0]))
     gltf, _ = glb_parts(encode("glb", random_gaussians(1), camera, 1))
@@ -211,9 +211,12 @@ def test_glb_keeps_the_photos_camera_and_the_border() -> None:
     torch.testing.assert_close(there[:3] * torch.tensor([1.0, -1.0, -1.0]), expected[:3])
     still, _ = glb_parts(encode("glb", random_gaussians(1), lens))
     assert "matrix" not in still["nodes"][1]
-    assert b"spackle_camera" not in encode(
-        "ply", random_gaussians(1), camera
-    )  # its comment has no room for a pose
+    # A PLY keeps the camera's pose in a comment of its own.
+    file = tmp_path / "scene.ply"
+    file.write_bytes(encode("ply", random_gaussians(1), camera))
+    kept = load_scene(file).camera
+    assert kept is not None
+    torch.testing.assert_close(kept.world_to_camera.float(), camera.world_to_camera)
 
 
 def test_compressed_ply_keeps_the_base_before_the_aux() -> None:
