@@ -148,6 +148,8 @@ def test_python_gives_the_scene(tmp_path: Path) -> None:
     scene = spackle.predict_posed(folder, fill="none")
     assert len(scene.aux) == 0
     assert list(scene.cameras) == ["1.jpg", "0.jpg", "2.jpg"]
+    scene.save(tmp_path / "scene.html")  # the page of the viewer
+    assert b"<title>" in (tmp_path / "scene.html").read_bytes()
     scene.save(tmp_path / "scene.ply")
     loaded = load_scene(tmp_path / "scene.ply")
     assert loaded.base_count == len(scene.base)

@@ -36,6 +36,7 @@ from spackle.posed.matching import match_depths
 from spackle.posed.path import central_first, focus_depth, path_through, views_to_fill
 from spackle.posed.union import MIN_ALPHA, PlacedPhoto, Union, merge_photos
 from spackle.residual import hole_area_ratio
+from spackle.results.saved_scene import PAGE_ENCODERS
 from spackle.runtime.digests import file_fingerprint, json_digest
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
@@ -111,7 +112,7 @@ class PosedScene:
             base_count=len(self.base),
             is_metric=self.is_metric,
         )
-        write_atomic(path, encoder_for(Path(path))(content))
+        write_atomic(path, encoder_for(Path(path), PAGE_ENCODERS)(content))
 
 
 def complete_posed(
