@@ -111,6 +111,11 @@ class Camera:
         uv = local_points[..., :2] / z[..., None] * focal + principal_point
         return uv, z
 
+    def has_in_frame(self, uv: Tensor, z: Tensor) -> Tensor:
+        """[...] bool: which pixel positions [..., 2] at depth z [...] lie in the picture."""
+        size = uv.new_tensor([self.width, self.height])
+        return (z > 0) & ((uv >= 0) & (uv < size)).all(dim=-1)
+
     def unproject(self, uv: Tensor, depth: Tensor) -> Tensor:
         """Unproject pixels [..., 2] at depth z [...] to world points [..., 3]."""
         K = to_like(self.K, uv)

@@ -136,9 +136,7 @@ class DepthColorScale:
 def _inverse_depths_in_view(means: Tensor, camera: Camera) -> Tensor:
     """1/z of those of the points [N, 3] that are in front of the camera and inside its image."""
     uv, z = camera.to("cpu").project(means)
-    size = uv.new_tensor([camera.width, camera.height])
-    is_in_image = (uv >= 0).all(dim=-1) & (uv < size).all(dim=-1)
-    is_in_view = (z > 0) & is_in_image
+    is_in_view = camera.has_in_frame(uv, z)
     if not bool(is_in_view.any()):
         return z[is_in_view]
     # A much nearer Gaussian than the others is in the lens.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.formats.gaussian_columns import Floats, GaussianColumns
 from spackle.formats.ply import stored_logits
 from spackle.formats.ply_layout import NoGaussiansError, PlyLayout
-from spackle.formats.ply_tables import MAX_HEADER_BYTES, PlyElement, PlyTables
+from spackle.formats.ply_tables import PlyElement, PlyTables, with_vertex_count
 
 
 def append_to_ply(source: str | os.PathLike[str], aux: Gaussians) -> bytes | None:
@@ -35,16 +34,15 @@ def append_to_ply(source: str | os.PathLike[str], aux: Gaussians) -> bytes | Non
         InputError: the file is no PLY file, or damaged.
     """
     tables = PlyTables(source)
-    vertices = tables.elements_named("vertex")
-    if tables.is_text or tables.elements_named("chunk") or len(vertices) != 1:
+    vertex = tables.movable_vertices
+    if vertex is None:
         return None
-    vertex = vertices[0]
     try:
         layout = PlyLayout.find(vertex.fields)
     except NoGaussiansError:
         return None
     has_linear_colors = any(element.name == "intrinsic" for element in tables.elements)
-    if not tables.has_known_place(vertex) or not _has_room(layout, aux) or has_linear_colors:
+    if not _has_room(layout, aux) or has_linear_colors:
         return None
 
     content = Path(source).read_bytes()
@@ -66,13 +64,7 @@ def _has_room(layout: PlyLayout, aux: Gaussians) -> bool:
 
 def _longer_header(header: bytes, vertex: PlyElement, count: int) -> bytes:
     """The header of a file with `count` more vertices, and with a note where the new ones begin."""
-    total = vertex.row_count + count
-    longer = re.sub(
-        rb"(\n[ \t]*element[ \t]+vertex[ \t]+)\d+",
-        lambda match: match.group(1) + str(total).encode(),
-        header[:MAX_HEADER_BYTES],
-        count=1,
-    )
+    longer = with_vertex_count(header, vertex.row_count + count)
     if b"comment spackle_base" in longer:  # of an earlier fill, whose additions are not the base
         return longer
     note = f"\ncomment spackle_base {vertex.row_count}".encode()

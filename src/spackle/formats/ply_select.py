@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.formats.ply import PlyFile
-from spackle.formats.ply_tables import MAX_HEADER_BYTES, PlyTables
+from spackle.formats.ply_tables import PlyTables, with_vertex_count
 
 
 def select_in_ply(source: str | os.PathLike[str], is_kept: Tensor) -> bytes | None:
@@ -32,11 +32,8 @@ def select_in_ply(source: str | os.PathLike[str], is_kept: Tensor) -> bytes | No
         InputError: the file is no PLY file, or damaged.
     """
     tables = PlyTables(source)
-    vertices = tables.elements_named("vertex")
-    if tables.is_text or tables.elements_named("chunk") or len(vertices) != 1:
-        return None
-    vertex = vertices[0]
-    if not tables.has_known_place(vertex):
+    vertex = tables.movable_vertices
+    if vertex is None:
         return None
 
     keeps_row = _kept_rows(source, vertex.row_count, is_kept)
@@ -73,12 +70,7 @@ def _shorter_header(header: bytes, keeps_row: NDArray[np.bool_]) -> bytes:
         count = int(np.count_nonzero(keeps_row[: int(match.group(2))]))
         return match.group(1) + str(count).encode()
 
-    total = str(int(np.count_nonzero(keeps_row))).encode()
-    text = header[:MAX_HEADER_BYTES]
-    text = re.sub(
-        rb"(\n[ \t]*element[ \t]+vertex[ \t]+)\d+",
-        lambda match: match.group(1) + total,
-        text,
-        count=1,
+    shorter = with_vertex_count(header, int(np.count_nonzero(keeps_row)))
+    return re.sub(
+        rb"(\n[ \t]*comment[ \t]+spackle_base[ \t]+)(\d+)", count_of_base, shorter, count=1
     )
-    return re.sub(rb"(\n[ \t]*comment[ \t]+spackle_base[ \t]+)(\d+)", count_of_base, text, count=1)

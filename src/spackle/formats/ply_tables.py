@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
 from spackle.core.image_formats import GIT_LFS, HEAD_BYTES, WEB_PAGE, kind_of_bytes
+from spackle.formats.scene_content import is_at_origin
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 
@@ -85,9 +85,10 @@ def ply_header(
         numbers = [*camera.focal, *principal_point, camera.width, camera.height]
         # repr() writes as many digits as the exact number needs.
         lines.append("comment spackle_camera " + " ".join(repr(number) for number in numbers))
-        pose = camera.world_to_camera.double()
-        if not torch.equal(pose, torch.eye(4).to(pose)):
-            rows = pose[:3].flatten().tolist()  # the last row is always 0 0 0 1
+        if not is_at_origin(camera):
+            rows = (
+                camera.world_to_camera.double()[:3].flatten().tolist()
+            )  # the last row is always 0 0 0 1
             lines.append("comment spackle_pose " + " ".join(repr(number) for number in rows))
     if base_count is not None:
         lines.append(f"comment spackle_base {base_count!r}")
@@ -102,6 +103,16 @@ def ply_header(
             lines.append(f"property {table.type} {property_name}")
     lines.append("end_header")
     return "".join(f"{line}\n" for line in lines).encode()
+
+
+def with_vertex_count(header: bytes, count: int) -> bytes:
+    """A PLY file's header that announces another number of vertices; all else stays."""
+    return re.sub(
+        rb"(\n[ \t]*element[ \t]+vertex[ \t]+)\d+",
+        lambda match: match.group(1) + str(count).encode(),
+        header[:MAX_HEADER_BYTES],
+        count=1,
+    )
 
 
 @dataclasses.dataclass
@@ -182,6 +193,17 @@ class PlyTables:
         """Return whether the rows of a table can be read: they have no lists, nor tables before."""
         is_placed = element.start_byte >= 0 or element.start_line >= 0
         return is_placed and not element.has_lists
+
+    @property
+    def movable_vertices(self) -> PlyElement | None:
+        """The table of Gaussians if its rows can be copied byte for byte, else None.
+
+        They cannot in a text file, or in a compressed one, whose chunks refer to places of rows.
+        """
+        vertices = self.elements_named("vertex")
+        if self.is_text or self.elements_named("chunk") or len(vertices) != 1:
+            return None
+        return vertices[0] if self.has_known_place(vertices[0]) else None
 
     def rows(self, element: PlyElement) -> NDArray[Any]:
         """Read the rows of a table, as a structured array [row_count].

@@ -9,6 +9,7 @@ import dataclasses
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
@@ -79,6 +80,13 @@ class SceneFile:
         if self.harmonics_degree > kept_degree:
             losses.append(harmonics_loss(self.harmonics_degree, kept_degree))
         return losses
+
+    @property
+    def is_added(self) -> Tensor:
+        """[N] bool: the Gaussians that were added to fill holes; none if that is not known."""
+        count = len(self.gaussians)
+        base_count = count if self.base_count is None else self.base_count
+        return torch.arange(count) >= base_count
 
 
 def is_at_origin(camera: Camera) -> bool:

@@ -116,8 +116,7 @@ def _ply_positions(file: Path) -> Tensor:
 def _unhidden(xyz: Tensor, camera: Camera) -> SeenPoints:
     """The points in a camera's picture that no nearer point hides."""
     uv, z = camera.project(xyz)
-    size = torch.tensor([camera.width, camera.height])
-    is_inside = (z > 0) & ((uv >= 0) & (uv < size)).all(1)
+    is_inside = camera.has_in_frame(uv, z)
     uv, z = uv[is_inside], z[is_inside]
     if not len(z):
         return SeenPoints(uv.float(), z.float())

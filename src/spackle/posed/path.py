@@ -85,7 +85,7 @@ def path_seconds(photo_count: int) -> float:
 def focus_depth(gaussians: Gaussians, camera: Camera) -> float:
     """The median depth of the Gaussians that lie in a camera's picture, in the world's unit."""
     uv, z = camera.project(gaussians.means)
-    is_inside = (z > 0) & ((uv >= 0) & (uv < torch.tensor([camera.width, camera.height]))).all(1)
+    is_inside = camera.has_in_frame(uv, z)
     # A camera that sees nothing of the scene still needs a point to look at.
     depths = z[is_inside] if bool(is_inside.any()) else z.abs()
     return float(depths.median())

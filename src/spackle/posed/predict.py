@@ -223,13 +223,8 @@ def _write_files(
     def frames(progress: Progress) -> Iterator[Tensor]:
         """Each frame of the video, as the encoder asks for it."""
         for index, camera in enumerate(scene.path):
-            with torch.no_grad():
-                # One picture of each frame, or two for a stereo video.
-                renderings = [
-                    renderer.render([scene.base, scene.aux], maker.resized_camera(eye))
-                    for eye in maker.eyes(camera)
-                ]
-                yield maker.frame(renderings)
+            frame, _ = maker.render([[scene.base, scene.aux]], camera, renderer)
+            yield frame
             progress(index + 1, len(scene.path))
 
     with reporter.stage("video") as progress:

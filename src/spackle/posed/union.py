@@ -169,8 +169,7 @@ def _depth_bounds(photo: PlacedPhoto) -> tuple[Tensor, Tensor]:
 
 def _pixels(uv: Tensor, z: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """Which of N points lie in a picture, [N] bool, and their rows and columns [N]."""
-    size = torch.tensor([camera.width, camera.height])
-    is_inside = (z > 0) & ((uv >= 0) & (uv < size)).all(1)
+    is_inside = camera.has_in_frame(uv, z)
     column = uv[:, 0].floor().clamp(0, camera.width - 1).long()
     row = uv[:, 1].floor().clamp(0, camera.height - 1).long()
     return is_inside, row, column

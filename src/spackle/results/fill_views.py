@@ -212,9 +212,7 @@ def _depth_range(scene: SceneFile, camera: Camera) -> DepthRange:
         return Scene.of_file(scene).depth_range
     # Any other camera has Gaussians beside and behind it, too.
     uv, z = camera.project(scene.gaussians.means)
-    size = uv.new_tensor([camera.width, camera.height])
-    in_frame = (z > 0) & ((uv >= 0) & (uv < size)).all(-1)
-    seen = scene.gaussians.select(in_frame).transform(camera.world_to_camera)
+    seen = scene.gaussians.select(camera.has_in_frame(uv, z)).transform(camera.world_to_camera)
     return DepthRange.of(seen, is_metric=scene.is_metric)
 
 

@@ -80,7 +80,7 @@ def fill_saved_scene(
             )
         before = _mean(plan.hole_ratios)
         after = _mean(_hole_ratios(filled, chosen.cameras, plan, renderer))
-        write_atomic(output, _encoded(loaded, filled, encode))
+        write_atomic(output, encode_filled(loaded, filled, encode))
 
     aux_count = len(filled) - len(loaded.gaussians)
     holes = f"holes {before:.1%} -> {after:.2%} of {len(chosen.cameras)} views"
@@ -116,8 +116,14 @@ def _hole_ratios(
     return ratios
 
 
-def _encoded(loaded: SceneFile, filled: Gaussians, encode: Encoder) -> bytes:
-    """The bytes of a filled scene; of a PLY, the rows of the file and then the new ones."""
+def encode_filled(loaded: SceneFile, filled: Gaussians, encode: Encoder) -> bytes:
+    """The bytes of a filled scene; of a PLY, the rows of the file and then the new ones.
+
+    Args:
+        loaded: the scene before the fill, as its file holds it.
+        filled: its Gaussians, and then those that were added.
+        encode: of the format to write.
+    """
     count = len(loaded.gaussians)
     if encode is encode_ply and loaded.format == "PLY":
         aux = filled.select(slice(count, None)).with_harmonics_count(0)

@@ -14,7 +14,6 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.formats.ply import encode_ply
-from spackle.formats.ply_append import append_to_ply
 from spackle.formats.ply_select import select_in_ply
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import SCENE_ENCODERS, Encoder, encoder_for, load_scene
@@ -22,6 +21,7 @@ from spackle.pipeline import Removal, remove
 from spackle.render import Renderer, get_renderer
 from spackle.residual.features import hole_mask
 from spackle.results.fill_views import FillViewsOptions, choose_fill_views, named_camera
+from spackle.results.filled_scene import encode_filled
 from spackle.results.mask_files import read_mask
 from spackle.results.saved_scene import log_losses
 from spackle.runtime.errors import InputError
@@ -127,8 +127,9 @@ def remove_from_saved_scene(
             removed = remove(
                 loaded.gaussians, marked, cameras, renderer=renderer, progress=progress
             )
-        write_atomic(edit_file, _encoded_edit(loaded, removed, encode))
-        write_atomic(output, _encoded_patch(loaded, removed, encode, edit_file))
+        edited = _edited_scene(loaded, removed, edit_file)
+        write_atomic(edit_file, _encoded_edit(loaded, removed, edited, encode))
+        write_atomic(output, encode_filled(edited, removed.patched, encode))
 
     opened, open_still = _hole_ratios(loaded.gaussians, removed, cameras, renderer)
     removed_count = int(marked.sum())
@@ -208,9 +209,7 @@ def _marked(
     if marks:
         sources.append("the masks" if len(marks) > 1 else "the mask")
         # What a former fill has made up behind the thing is made up anew, now that more is seen.
-        is_invented = torch.zeros(len(gaussians), dtype=torch.bool)
-        is_invented[scene.base_count :] = scene.base_count is not None
-        marked |= marked_gaussians(gaussians, marks, renderer, is_invented=is_invented)
+        marked |= marked_gaussians(gaussians, marks, renderer, is_invented=scene.is_added)
     if box is not None:
         sources.append("`box`")
         smallest, largest = corners_of(box)
@@ -235,30 +234,23 @@ def _is_among(camera: Camera, others: Sequence[Camera]) -> bool:
     )
 
 
-def _encoded_edit(loaded: SceneFile, removed: Removal, encode: Encoder) -> bytes:
+def _edited_scene(loaded: SceneFile, removed: Removal, edit_file: Path) -> SceneFile:
+    """A scene without what was taken out, as the file `edit_file` holds it."""
+    base_count = loaded.base_count
+    if base_count is not None:
+        base_count = int(removed.is_kept[:base_count].sum())
+    return dataclasses.replace(
+        loaded, path=edit_file, gaussians=removed.edited, base_count=base_count
+    )
+
+
+def _encoded_edit(loaded: SceneFile, removed: Removal, edited: SceneFile, encode: Encoder) -> bytes:
     """The bytes of a scene without what was taken out; of a PLY, the rows of the file."""
     if encode is encode_ply and loaded.format == "PLY":
         content = select_in_ply(loaded.path, removed.is_kept)
         if content is not None:
             return content
-    base_count = loaded.base_count
-    if base_count is not None:
-        base_count = int(removed.is_kept[:base_count].sum())
-    return encode(dataclasses.replace(loaded, gaussians=removed.edited, base_count=base_count))
-
-
-def _encoded_patch(loaded: SceneFile, removed: Removal, encode: Encoder, edit_file: Path) -> bytes:
-    """The bytes of the patched scene; of a PLY, those of the edit's rows and then the new ones."""
-    count = len(removed.edited)
-    if encode is encode_ply and loaded.format == "PLY":
-        aux = removed.patched.select(slice(count, None)).with_harmonics_count(0)
-        content = append_to_ply(edit_file, aux)
-        if content is not None:
-            return content
-    base_count = count
-    if loaded.base_count is not None:
-        base_count = int(removed.is_kept[: loaded.base_count].sum())
-    return encode(dataclasses.replace(loaded, gaussians=removed.patched, base_count=base_count))
+    return encode(edited)
 
 
 @torch.no_grad()

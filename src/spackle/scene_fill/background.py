@@ -350,12 +350,9 @@ def _ask_rays(
     unsure_count = torch.zeros(z_of_points.shape)
     for witness in witnesses:
         place, z = witness.camera.project(points)
-        height, width = witness.depth.shape
-        column = place[..., 0].floor()
-        row = place[..., 1].floor()
-        is_inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        column = torch.where(is_inside, column, 0).long()
-        row = torch.where(is_inside, row, 0).long()
+        is_inside = witness.camera.has_in_frame(place, z)
+        column = torch.where(is_inside, place[..., 0].floor(), 0).long()
+        row = torch.where(is_inside, place[..., 1].floor(), 0).long()
 
         surface_depth = witness.depth[row, column]
         shows_surface = is_inside & (surface_depth > 0)

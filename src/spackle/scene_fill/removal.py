@@ -176,8 +176,7 @@ def _votes(
     uv, z = camera.to("cpu", torch.float64).project(means)
     column = uv[:, 0].floor()
     row = uv[:, 1].floor()
-    is_inside = (z > 0) & (column >= 0) & (column < camera.width)
-    is_inside &= (row >= 0) & (row < camera.height)
+    is_inside = camera.has_in_frame(uv, z)
     index = torch.where(is_inside, row * camera.width + column, 0).long()
 
     def at_center(image: Tensor) -> Tensor:

@@ -99,10 +99,8 @@ def remove_and_patch(
     loaded = load_scene(source)
     with reporter.stage("remove"):
         # What an earlier fill has made up behind the thing goes with it.
-        index = torch.arange(len(loaded.gaussians))
-        base_count = len(index) if loaded.base_count is None else loaded.base_count
         marked = marked_gaussians(
-            loaded.gaussians, [(camera, mask)], renderer, is_invented=index >= base_count
+            loaded.gaussians, [(camera, mask)], renderer, is_invented=loaded.is_added
         )
     removed_count = int(marked.sum())
     if removed_count == 0:
