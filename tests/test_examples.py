@@ -66,6 +66,16 @@ def test_examples_of_a_photo(photo: Path, tmp_path: Path) -> None:
     assert len(decode(tmp_path / "6.mp4")) > 30
 
 
+def test_the_example_of_progress_and_cancel(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main_of(19)(photo, tmp_path / "late.ply", 0)
+    assert capsys.readouterr().out.splitlines()[-1] == f"{photo}: ended after 0 s"
+    main_of(19)(photo, tmp_path / "photo.ply", 600)
+    assert "complete 100%" in capsys.readouterr().out.splitlines()
+    assert [path.name for path in tmp_path.iterdir()] == ["photo.ply"]
+
+
 def test_the_example_of_a_depth_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main_of(2)(
         write_photo(tmp_path / "photo.png"), write_depth(tmp_path / "depth.png"), tmp_path / "out"

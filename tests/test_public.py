@@ -15,11 +15,11 @@ from spackle.cli import app
 
 ROOT = Path(__file__).parents[1]
 PYTHON = """
-Base BasePrediction Camera DepthMap FillContext Gaussians HfBase InputError LiteBase MogeBase
-Photo PosedScene Renderer Rendering
-Scene SharpBase Spackle complete complete_view fill fill_scene fill_view get_renderer
-hole_area_ratio hole_mask
-load_cameras load_depth load_photo load_ply marked_gaussians predict predict_posed remove save_ply
+Base BasePrediction Camera Cancelled DepthMap FillContext Gaussians HfBase InputError LiteBase
+MogeBase Photo PosedScene Renderer Rendering Scene SceneReport SharpBase Spackle StageProgress
+complete complete_view fill fill_scene fill_view get_renderer hole_area_ratio hole_mask
+load_cameras load_depth load_photo load_ply marked_gaussians predict predict_posed remove
+save_ply
 """
 COMMANDS = """
 bench; dataset build; dataset info; dataset preview; dataset verify; demo; evaluate; export;

@@ -39,8 +39,11 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.residual import complete_view as complete_view
     from spackle.residual import hole_area_ratio as hole_area_ratio
     from spackle.residual import hole_mask as hole_mask
+    from spackle.runtime.errors import Cancelled as Cancelled
     from spackle.runtime.errors import InputError as InputError
+    from spackle.runtime.progress import StageProgress as StageProgress
     from spackle.scene import Scene as Scene
+    from spackle.scene import SceneReport as SceneReport
     from spackle.scene_fill import FillContext as FillContext
     from spackle.scene_fill import fill_scene as fill_scene
     from spackle.scene_fill import fill_view as fill_view
@@ -58,7 +61,8 @@ _NAMES_BY_MODULE = {
     "spackle.bases.moge.base": ("MogeBase",),
     "spackle.bases.sharp": ("SharpBase",),
     "spackle.core.camera": ("Camera",),
-    "spackle.runtime.errors": ("InputError",),
+    "spackle.runtime.errors": ("Cancelled", "InputError"),
+    "spackle.runtime.progress": ("StageProgress",),
     "spackle.formats": ("load_cameras", "load_ply", "save_ply"),
     "spackle.core.gaussians": ("Gaussians",),
     "spackle.core.photo": ("Photo", "load_photo"),
@@ -68,7 +72,7 @@ _NAMES_BY_MODULE = {
     "spackle.pipeline": ("complete", "fill", "remove"),
     "spackle.posed.predict": ("predict_posed",),
     "spackle.posed.scene": ("PosedScene",),
-    "spackle.scene": ("Scene",),
+    "spackle.scene": ("Scene", "SceneReport"),
     "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view", "marked_gaussians"),
     "spackle.api": ("Spackle", "predict"),
 }

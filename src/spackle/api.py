@@ -30,7 +30,7 @@ from spackle.pipeline import FillMode, FillOptions, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError, short_repr, shorten_input_errors
-from spackle.runtime.progress import LogReporter
+from spackle.runtime.progress import Cancel, LogReporter, ProgressListener
 from spackle.scene import Scene
 from spackle.views import PathOptions
 
@@ -129,7 +129,8 @@ class Spackle:
         focal_px: float | None = None,
         focal_mm: float | None = None,
         fov: float | None = None,
-        progress: bool = False,
+        progress: bool | ProgressListener = False,
+        cancel: Cancel | None = None,
     ) -> Scene:
         """Turn a photo into a scene without holes along a camera path.
 
@@ -169,7 +170,7 @@ class Spackle:
                     fov=fov,
                 )
             )
-            return pipeline.complete(loaded_photo, LogReporter(progress)).scene
+            return pipeline.complete(loaded_photo, LogReporter(progress, cancel)).scene
 
 
 def predict(
@@ -190,12 +191,13 @@ def predict(
     focal_px: float | None = None,
     focal_mm: float | None = None,
     fov: float | None = None,
-    progress: bool = False,
+    progress: bool | ProgressListener = False,
+    cancel: Cancel | None = None,
 ) -> Scene:
     """Turn a photo into a scene without holes along a camera path.
 
-    For many photos keep a `Spackle`, which loads its networks once. The scene's `report` says how
-    it was made: its holes, base, focal length, warnings and times.
+    For many photos keep a `Spackle`, which loads its networks once. The scene's `report`, a
+    `SceneReport`, says how it was made: its holes, base, focal length, warnings and times.
 
     Args:
         photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an
@@ -221,11 +223,15 @@ def predict(
         focal_px: focal length in pixels of the photo.
         focal_mm: focal length in millimetres, as a 35 mm equivalent.
         fov: horizontal field of view in degrees.
-        progress: draw a bar on the standard error.
+        progress: True draws a bar on the standard error; a function gets a `StageProgress` at the
+            start of each stage and after each of its steps, such as the views of the fill.
+        cancel: a `threading.Event`, or a function that returns bool, which is asked between two
+            steps; once it is set or true, the work ends.
 
     Raises:
         InputError: a photo, a depth map, a name or weights that cannot be used; `base` together
             with `depth`, or a focal length for a loaded photo.
+        Cancelled: `cancel` has asked for the end.
     """
     # A session for this one photo; what it loads is freed with it.
     session = Spackle(
@@ -243,6 +249,7 @@ def predict(
         focal_mm=focal_mm,
         fov=fov,
         progress=progress,
+        cancel=cancel,
     )
 
 

@@ -39,7 +39,13 @@ from spackle.residual.architectures import (
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError, check_name
 from spackle.runtime.plugins import check_name_or_plugin, is_plugin
-from spackle.runtime.progress import Progress, Reporter
+from spackle.runtime.progress import (
+    Cancel,
+    Progress,
+    Reporter,
+    cancellable,
+    raise_if_cancelled,
+)
 from spackle.scene import Scene, SceneReport, ViewHoles
 from spackle.scene_fill.context import FillContext
 from spackle.scene_fill.fill import fill_scene, fill_view
@@ -505,6 +511,7 @@ def complete(
     fill: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
+    cancel: Cancel | None = None,
 ) -> Scene:
     """Fill the holes of all views by one set of Gaussians, which are added to the base's.
 
@@ -517,7 +524,12 @@ def complete(
         fill: where the texture comes from, see `open_texture`; "none" keeps the holes.
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
+        cancel: asks for the end of the work between two views, as for `predict`.
+
+    Raises:
+        Cancelled: `cancel` has asked for the end.
     """
+    raise_if_cancelled(cancel)
     context = FillContext.of(
         prediction,
         renderer or get_renderer(),
@@ -526,7 +538,7 @@ def complete(
     )
     views_to_fill = cameras if fill != "none" else ()
     start = time.perf_counter()
-    filled = fill_scene(context, views_to_fill, exact=exact, progress=progress)
+    filled = fill_scene(context, views_to_fill, exact=exact, progress=cancellable(progress, cancel))
     report = SceneReport(
         focal_px=prediction.camera.focal[0],
         focal_source=prediction.lens_source or None,
@@ -552,6 +564,7 @@ def fill(
     texture: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
+    cancel: Cancel | None = None,
 ) -> Gaussians:
     """A scene of any program with Gaussians added where its cameras see holes.
 
@@ -574,9 +587,11 @@ def fill(
         texture: where the texture comes from, as `fill` of `complete`.
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
+        cancel: asks for the end of the work between two views, as for `predict`.
 
     Raises:
         ValueError: there are no cameras, `fillable` does not fit them, or `background` is unknown.
+        Cancelled: `cancel` has asked for the end.
     """
     if not cameras:
         raise ValueError("`cameras` is empty: give the views to fill")
@@ -584,6 +599,7 @@ def fill(
         raise ValueError(f"unknown `background` {background!r}: give keep or fill")
     if fillable is not None:
         _check_fillable(fillable, cameras)
+    raise_if_cancelled(cancel)
     renderer = renderer or get_renderer()
     plan = plan_fill(
         gaussians,
@@ -593,6 +609,7 @@ def fill(
         fillable=fillable,
         photo_camera=photo_camera,
     )
+    raise_if_cancelled(cancel)  # planning has rendered all views
     return fill_as_planned(
         gaussians,
         cameras,
@@ -600,7 +617,7 @@ def fill(
         renderer,
         network=network,
         texture=texture,
-        progress=progress,
+        progress=cancellable(progress, cancel),
     )
 
 
@@ -671,6 +688,7 @@ def remove(
     texture: str = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
+    cancel: Cancel | None = None,
 ) -> Removal:
     """Take Gaussians out of a scene, and fill what they hid, as cameras see it.
 
@@ -686,9 +704,11 @@ def remove(
         texture: as for `fill`.
         renderer: as for `fill`.
         progress: as for `fill`.
+        cancel: as for `fill`.
 
     Raises:
         ValueError: `marked` marks nothing or everything, or there are no cameras.
+        Cancelled: `cancel` has asked for the end.
     """
     if tuple(marked.shape) != (len(gaussians),) or marked.dtype != torch.bool:
         raise ValueError(f"`marked` must be [{len(gaussians)}] bool")
@@ -708,6 +728,7 @@ def remove(
         texture=texture,
         renderer=renderer,
         progress=progress,
+        cancel=cancel,
         fillable=uncovered_pixels(gaussians, edited, cameras, renderer),
         photo_camera=cameras[0],
     )

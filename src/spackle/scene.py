@@ -33,6 +33,7 @@ from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask
 from spackle.runtime.files import PathOrFile, write_atomic
+from spackle.runtime.progress import Cancel, Progress, cancellable
 from spackle.video.encoding import save_video
 from spackle.video.frames import FrameMaker
 from spackle.video.options import Fit, Show, StereoLayout, VideoOptions, parse_size
@@ -331,6 +332,8 @@ class Scene:
         ipd: float | None = None,
         convergence: float | None = None,
         compare: bool = False,
+        progress: Progress | None = None,
+        cancel: Cancel | None = None,
     ) -> None:
         """Write a video of a camera path that repeats without a jump, as `spackle render` does.
 
@@ -354,9 +357,12 @@ class Scene:
             ipd: distance of the eyes in metres.
             convergence: depth in metres that appears in the plane of the screen.
             compare: show the base on the left and the completed scene on the right.
+            progress: called with (frames done, all frames).
+            cancel: asks for the end of the work between two frames, as for `spackle.predict`.
 
         Raises:
             InputError: an option is impossible, or contradicts another one.
+            Cancelled: `cancel` has asked for the end; no video is written.
         """
         # Numbers go the way of a text, too, because `parse_size` checks them.
         if size is not None and not isinstance(size, str):
@@ -381,7 +387,7 @@ class Scene:
             overscan=overscan,
         )
 
-        self._write_video(target, format, path, renderer)
+        self._write_video(target, format, path, renderer, cancellable(progress, cancel))
 
     def _write_video(
         self,
@@ -389,16 +395,17 @@ class Scene:
         format: str | None,
         path: PathOptions,
         renderer: Renderer | None,
+        progress: Progress,
     ) -> None:
         """Write a video along `path` to a path or an open file.
 
         `format` is the name of a video format; None: that of the target's suffix, or mp4 for an
-        open file.
+        open file. `progress` is called with (frames done, all frames).
         """
         # The encoder writes to a path, and takes the format from its suffix.
         if format is None and isinstance(target, str | os.PathLike):
             file = Path(target)
-            self._encode_video(file, path, renderer, name_in_messages=file)
+            self._encode_video(file, path, renderer, progress, name_in_messages=file)
             return
 
         # In all other cases a temporary file has the right suffix. Messages must not name it by
@@ -406,7 +413,7 @@ class Scene:
         with tempfile.TemporaryDirectory() as folder:
             name = Path(f"video.{format or 'mp4'}")
             file = Path(folder) / name
-            self._encode_video(file, path, renderer, name_in_messages=name)
+            self._encode_video(file, path, renderer, progress, name_in_messages=name)
             write_atomic(target, file.read_bytes())
 
     def _encode_video(
@@ -414,6 +421,7 @@ class Scene:
         file: Path,
         path: PathOptions,
         renderer: Renderer | None,
+        progress: Progress,
         *,
         name_in_messages: Path,
     ) -> None:
@@ -423,6 +431,7 @@ class Scene:
             file: the video, whose suffix is its format.
             path: the options of path and video.
             renderer: None: the best renderer of this machine.
+            progress: called with (frames done, all frames).
             name_in_messages: stands for `file` in error messages.
 
         Raises:
@@ -450,9 +459,11 @@ class Scene:
 
         def render_frames() -> Iterator[Tensor]:
             """Render each frame [H, W, 3] when the encoder asks for it, to save memory."""
-            for camera in cameras:
+            progress(0, len(cameras))
+            for index, camera in enumerate(cameras):
                 frame, _ = frame_maker.render(gaussian_sets, camera, used_renderer)
                 yield frame
+                progress(index + 1, len(cameras))
 
         save_video(render_frames(), file, fps, video.loop, name_in_messages=name_in_messages)
 

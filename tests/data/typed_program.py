@@ -5,6 +5,7 @@ and nothing else.
 from __future__ import annotations
 
 import io
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,16 @@ def main(photo: Path) -> None:
     completed = spackle.complete(
         prediction, cameras, exact=True, progress=lambda done, total: print(done, total)
     )
+    stop = threading.Event()
+    try:
+        ended = spackle.predict(
+            photo, progress=lambda update: print(update.stage, update.share), cancel=stop
+        )
+    except spackle.Cancelled:
+        ended = spackle.predict(photo, cancel=lambda: stop.is_set())
+    report: spackle.SceneReport | None = ended.report
+    before: float | None = report.hole_ratio_before if report else None
+    print(before)
     gaussians: spackle.Gaussians = completed.gaussians
     loaded = spackle.Scene.load("scene.ply", fov=60.0)
     spackle.save_ply(gaussians, "all.ply", camera=completed.camera, base_count=len(completed.base))
@@ -51,6 +62,6 @@ def main(photo: Path) -> None:
 def wrong() -> None:
     scene = spackle.predict("photo.jpg", trajectory="sideways")  # arg-type
     scene.export(3)  # arg-type
-    spackle.Spackle(fill="paint")  # arg-type
+    spackle.Spackle(mode="paint")  # arg-type
     number: int = spackle.load_ply("a.ply")  # assignment
     print(number, spackle.predct("photo.jpg"))  # attr-defined

@@ -30,7 +30,13 @@ from spackle.runtime.digests import file_fingerprint, file_records, json_digest,
 from spackle.runtime.errors import InputError, shorten_input_errors
 from spackle.runtime.files import write_atomic, write_json
 from spackle.runtime.folders import atomic_files, results_folder
-from spackle.runtime.progress import LogReporter, Progress, Reporter
+from spackle.runtime.progress import (
+    Cancel,
+    LogReporter,
+    Progress,
+    ProgressListener,
+    Reporter,
+)
 from spackle.video.encoding import save_video
 from spackle.video.frames import FrameMaker
 from spackle.views import MAX_FRAME_COUNT
@@ -48,7 +54,8 @@ def predict_posed(
     base: str = AUTO,
     fill: str = "auto",
     device: str = "auto",
-    progress: bool = False,
+    progress: bool | ProgressListener = False,
+    cancel: Cancel | None = None,
 ) -> PosedScene:
     """Turn a folder of photos with known cameras into one scene without holes between them.
 
@@ -59,10 +66,12 @@ def predict_posed(
             lifts the depth maps beside the photos, if there are any.
         fill: source of the texture in the holes; "none" keeps the holes.
         device: "auto", "cpu" or "cuda".
-        progress: draw a bar on the standard error.
+        progress: True draws a bar on the standard error; a function is called as for `predict`.
+        cancel: asks for the end of the work, as for `predict`.
 
     Raises:
         InputError: the folder, a photo, or a name cannot be used.
+        Cancelled: `cancel` has asked for the end.
     """
     options = PipelineOptions(
         base=BaseSettings(name=base, device=device), fill=FillOptions(fill=fill)
@@ -71,7 +80,7 @@ def predict_posed(
     return complete_posed(
         read_capture(Path(folder)),
         pipeline,
-        LogReporter(progress),
+        LogReporter(progress, cancel),
         frame_count=DEFAULT_PATH_FRAMES,
     )
 

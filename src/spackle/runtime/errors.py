@@ -1,4 +1,4 @@
-"""`InputError`, the one exception for bad input, and helpers for its messages."""
+"""`InputError`, the one exception for bad input, and helpers for its messages; `Cancelled`."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ _value_repr.maxother = MAX_VALUE_LENGTH
 
 class InputError(ValueError):
     """Bad input from a user; its text is a line that says what is wrong and what to do."""
+
+
+class Cancelled(Exception):
+    """The end of work that the caller's `cancel` has asked for; nothing half-written is left."""
 
 
 def reason_in_a_line(error: object) -> str:
@@ -88,7 +92,7 @@ def as_input_error(what: object, problem: str, *errors: type[Exception]) -> Iter
     bad_input = errors or (Exception,)
     try:
         yield
-    except InputError:  # has a message for the user already
+    except (InputError, Cancelled):  # one has its message already, the other is no error
         raise
     except bad_input as error:
         explained = problem.replace("{reason}", reason_in_a_line(error))

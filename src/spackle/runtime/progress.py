@@ -1,13 +1,16 @@
-"""Show the progress of long work as bars on a terminal or lines in a log, and end it at Ctrl-C.
+"""Tell how far long work is, as bars, log lines or calls of a function, and end it when asked.
 
-Functions that take long have a parameter `progress` of the type `Progress`. Commands pass a
-`Reporter` around, which logs messages, times stages, and makes such `progress` functions.
+Functions that take long have a parameter `progress` of the type `Progress`. Work of several stages
+gets a `Reporter`, which logs messages, times stages, and makes such `progress` functions. All of
+them pass through `Reporter.stage`: bars on a terminal, the jobs of the server, and the functions
+that a Python program gives as `progress` and `cancel`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import copy
+import dataclasses
 import json
 import logging
 import signal
@@ -32,9 +35,52 @@ from rich.progress import (
     Progress as Bars,
 )
 
-from spackle.runtime.errors import printable_line
+from spackle.runtime.errors import Cancelled, printable_line
 
 Progress = Callable[[int, int], None]  # reports (steps done, steps in all)
+# Asks for the end of work: an event that is set, or a function that returns true.
+Cancel = threading.Event | Callable[[], bool]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StageProgress:
+    """How far a stage of the work is."""
+
+    stage: str  # its name, as in the times of the report, such as "base" or "complete"
+    done: int  # steps: views, windows of a network, or frames
+    total: int  # steps in all; 0 if nobody knows how many
+
+    @property
+    def share(self) -> float | None:
+        """The part of the stage that is done, 0..1; None if nobody knows."""
+        return self.done / self.total if self.total else None
+
+
+ProgressListener = Callable[[StageProgress], None]  # called at each stage's start and each step
+
+
+def raise_if_cancelled(cancel: Cancel | None) -> None:
+    """Raise `Cancelled` if `cancel` asks for the end of the work."""
+    if cancel is None:
+        return
+    is_cancelled = cancel.is_set() if isinstance(cancel, threading.Event) else cancel()
+    if is_cancelled:
+        raise Cancelled("cancelled, as `cancel` asked")
+
+
+def cancellable(progress: Progress | None, cancel: Cancel | None) -> Progress:
+    """A function of (steps done, steps in all) that calls `progress`, or raises `Cancelled`.
+
+    It raises once `cancel` asks for the end of the work, so that work ends after any step.
+    """
+
+    def step(done: int, total: int) -> None:
+        """Report a step, unless the work is to end."""
+        raise_if_cancelled(cancel)
+        if progress is not None:
+            progress(done, total)
+
+    return step
 
 
 def pluralized(count: int, thing: str) -> str:
@@ -46,7 +92,13 @@ class Reporter:
     """Logs messages and progress, and times stages."""
 
     def __init__(
-        self, verbose: bool = False, console: Console | None = None, *, as_json: bool = False
+        self,
+        verbose: bool = False,
+        console: Console | None = None,
+        *,
+        as_json: bool = False,
+        listener: ProgressListener | None = None,
+        cancel: Cancel | None = None,
     ) -> None:
         """Make a reporter.
 
@@ -54,10 +106,14 @@ class Reporter:
             verbose: also log details.
             console: where messages and bars go; None is the standard error.
             as_json: print each result as a line of JSON on the standard output.
+            listener: called at the start of each stage, and after each of its steps.
+            cancel: asks for the end of the work, which a stage then ends by `Cancelled`.
         """
         self.console = console or Console(stderr=True, highlight=False)
         self.verbose = verbose
         self.as_json = as_json
+        self._listener = listener
+        self._cancel = cancel
         self.seconds: dict[str, float] = {}  # durations of the stages so far
 
     def restarted(self) -> Reporter:
@@ -86,17 +142,36 @@ class Reporter:
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Progress]:
-        """Time the block, and show a bar on a terminal; yields the function that moves the bar.
+        """Time the block, and tell how far it is; yields the function to call after each step.
 
         The duration is added to `self.seconds[name]`.
+
+        Raises:
+            Cancelled: `cancel` asked for the end, before the block, at a step, or after it.
         """
         start = time.perf_counter()
+
+        def tell(done: int, total: int) -> None:
+            """Tell the listener how far the stage is, unless the work is to end."""
+            raise_if_cancelled(self._cancel)
+            if self._listener is not None:
+                self._listener(StageProgress(stage=name, done=done, total=total))
+
+        tell(0, 0)  # nobody knows yet how many steps there are
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn()) as bars:
                 task = bars.add_task(name, total=None)
-                yield lambda done, total: bars.update(task, completed=done, total=total)
+
+                def tell_and_draw(done: int, total: int) -> None:
+                    """Tell the listener how far the stage is, and move the bar."""
+                    tell(done, total)
+                    bars.update(task, completed=done, total=total)
+
+                yield tell_and_draw
         else:
-            yield lambda done, total: None
+            yield tell
+        raise_if_cancelled(self._cancel)
+
         # A stage may run several times, such as once for each photo; its durations add up.
         elapsed = time.perf_counter() - start
         self.seconds[name] = round(self.seconds.get(name, 0.0) + elapsed, 3)
@@ -172,9 +247,21 @@ class Reporter:
 class LogReporter(Reporter):
     """Logs to the logger "spackle", for use as a library."""
 
-    def __init__(self, progress: bool = False) -> None:
-        """Make a reporter; with `progress`, it draws bars on the standard error."""
-        super().__init__(console=Console(stderr=True, force_terminal=progress, force_jupyter=False))
+    def __init__(
+        self, progress: bool | ProgressListener = False, cancel: Cancel | None = None
+    ) -> None:
+        """Make a reporter.
+
+        Args:
+            progress: True draws bars on the standard error; a function is called at the start of
+                each stage, and after each of its steps.
+            cancel: asks for the end of the work, which then raises `Cancelled`.
+        """
+        super().__init__(
+            console=Console(stderr=True, force_terminal=progress is True, force_jupyter=False),
+            listener=None if isinstance(progress, bool) else progress,
+            cancel=cancel,
+        )
         self._log = logging.getLogger("spackle")
 
     def log(self, line: str) -> None:

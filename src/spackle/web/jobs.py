@@ -20,6 +20,7 @@ from pydantic import BaseModel, Field
 from spackle.runtime.errors import InputError, reason_in_a_line
 from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
+from spackle.runtime.progress import StageProgress
 from spackle.runtime.task_process import WORKER_DIED, TaskEvent, TaskFunction, TaskProcess
 
 LOG = logging.getLogger("spackle.web")
@@ -308,18 +309,13 @@ class Jobs:
             self._record_end(id, error)
 
     def _note_event(self, id: str, event: TaskEvent) -> None:
-        """Note in a job's state what its process reports: {line}, or {stage, done, total}.
-
-        A total of 0 means that nobody knows how much there is to do.
-        """
+        """Note in a job's state what its process reports: {line}, or a `StageProgress`."""
         if "line" in event:
             LOG.info(event["line"])
             self._change(id, line=event["line"])
             return
-        share = None
-        if event["total"]:
-            share = event["done"] / event["total"]
-        self._change(id, stage=event["stage"], share=share)
+        update = StageProgress(**event)
+        self._change(id, stage=update.stage, share=update.share)
 
     def _record_end(self, id: str, error: str | None) -> None:
         """Record a job's end on the disk, then tell clients; delete the photo, which is private.

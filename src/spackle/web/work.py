@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +29,7 @@ from spackle.render import get_renderer
 from spackle.results.photo_folder import REPORT_NAME, PhotoOptions, predict_photo
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic, write_json
-from spackle.runtime.progress import Progress, Reporter
+from spackle.runtime.progress import Reporter, StageProgress
 from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
 from spackle.video.video_formats import DEFAULT_FPS
@@ -303,7 +302,12 @@ class JobReporter(Reporter):
 
     def __init__(self, job: Job, send_event: SendEvent, verbose: bool) -> None:
         """Report the work on a job through `send_event`; with `verbose`, details, too."""
-        super().__init__(verbose, Console(quiet=True, force_terminal=False))
+
+        def send_progress(update: StageProgress) -> None:
+            send_event(dataclasses.asdict(update))
+
+        console = Console(quiet=True, force_terminal=False)
+        super().__init__(verbose, console, listener=send_progress)
         self._job = job
         self._send_event = send_event
 
@@ -317,20 +321,6 @@ class JobReporter(Reporter):
     def log(self, line: str) -> None:
         """Send a line to the server."""
         self._send_event({"line": self.without_paths(line)})
-
-    @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[Progress]:
-        """Send the name of a stage and its progress to the server, and time it as `Reporter` does.
-
-        Yields a function of (done, total); a total of 0 means that nobody knows the total.
-        """
-
-        def send_progress(done: int, total: int) -> None:
-            self._send_event({"stage": name, "done": done, "total": total})
-
-        send_progress(0, 0)
-        with super().stage(name):
-            yield send_progress
 
 
 def check_photo(path: Path, name: str, preview: Path) -> None:
