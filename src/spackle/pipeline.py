@@ -595,8 +595,7 @@ def fill(
     """
     if not cameras:
         raise ValueError("`cameras` is empty: give the views to fill")
-    if background not in get_args(Background):
-        raise ValueError(f"unknown `background` {background!r}: give keep or fill")
+    check_name("background", background, get_args(Background))
     if fillable is not None:
         _check_fillable(fillable, cameras)
     raise_if_cancelled(cancel)

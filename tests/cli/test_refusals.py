@@ -39,7 +39,7 @@ BOTH = [
     ("--disparity 3", "--disparity"),
     (
         "--trajectory rotate_back",
-        "'--trajectory': 'rotate_back' is not one of 'swipe', 'shake', 'rotate'",
+        "--trajectory rotate_back is unknown: did you mean rotate? There are swipe, shake, rotate,",
     ),
     ("--path bad.json", "bad.json: keyframe 1: eye and target coincide"),
     ("--path good.json --disparity 0.2", "--disparity 0.2"),

@@ -28,7 +28,7 @@ from spackle.cli.export import export
 from spackle.cli.figures import figures
 from spackle.cli.fill import fill
 from spackle.cli.info import info
-from spackle.cli.messages import applications, with_flags
+from spackle.cli.messages import applications, with_flags, with_suggestion
 from spackle.cli.options import INTERRUPTED, PAPER_PANEL
 from spackle.cli.predict import predict
 from spackle.cli.render import render
@@ -167,8 +167,7 @@ def main() -> None:
         if type(error).__name__ == "NoArgsIsHelpError":  # without arguments the help is printed
             print(error.format_message(), file=sys.stderr)
             sys.exit(BAD_INPUT)
-        # pydantic's first words, which typer keeps, say nothing to a user.
-        _exit_with_error(error.format_message().replace("Value error, ", ""))
+        _exit_with_error(with_suggestion(error))
     except OSError as error:
         # Without a file name it is the standard output that fails, such as a pipe to a full disk.
         if error.filename is not None:

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import typer
 from typer.core import TyperGroup
+from typer.exceptions import TyperException
 from typer.main import get_command
 
+from spackle.runtime.errors import unknown_name
 from spackle.runtime.progress import Reporter
+from spackle.runtime.suggestions import closest_name, question
 
 # The application whose commands' options are known; `spackle.cli` adds it once all commands exist.
 applications: list[typer.Typer] = []
 
+QUOTED_COMMA = "', '"  # between the choices that typer lists
 # All other flags are the Python name with hyphens, such as --depth-kind for `depth_kind`.
 FLAGS_WITH_ANOTHER_NAME = {"windows_per_batch": "--sharp-windows", "from_camera": "--from"}
 
@@ -37,6 +41,27 @@ def with_flags(message: str) -> str:
 
     # A Python name in lower case; the group in parentheses is the name without backticks.
     return re.sub(r"`([a-z][a-z0-9_]*)`", flag_of, message)
+
+
+def with_suggestion(error: TyperException) -> str:
+    """The message of an error in the options, with the option or value that was probably meant.
+
+    It has the form of the library's messages about unknown names.
+    """
+    # pydantic's first words, which typer keeps, say nothing to a user.
+    message = error.format_message().replace("Value error, ", "")
+    # Typer finds similar options, but names all of them.
+    possible_options: Sequence[str] = getattr(error, "possibilities", None) or ()
+    if possible_options and hasattr(error, "option_name"):
+        return f"{error.message}{question(closest_name(error.option_name, possible_options))}"
+
+    # "Invalid value for '--mode': 'veiw' is not one of 'scene', 'view', 'paper'."
+    choice = re.fullmatch(r"Invalid value for '(.+)': '(.*)' is not one of '(.*)'\.", message)
+    if choice is None:
+        return message
+    quoted_option, value, quoted_names = choice.groups()
+    option = quoted_option.replace("'", "")  # an option with a short form is '-b' / '--background'
+    return f"{option} {value} is {unknown_name(value, quoted_names.split(QUOTED_COMMA))}"
 
 
 @functools.cache

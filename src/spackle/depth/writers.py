@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import unknown_suffix
 from spackle.runtime.files import write_atomic
 
 Metres = NDArray[np.float32]  # [H, W], 0 where unknown
@@ -29,9 +29,7 @@ def check_depth_name(path: str | os.PathLike[str]) -> DepthEncoder:
     """The encoder of depth maps for a file name's suffix; InputError for an unknown suffix."""
     encoder = DEPTH_ENCODERS.get(Path(path).suffix.lower())
     if encoder is None:
-        raise InputError(
-            f"{path}: not a name for a depth map: end the name with {', '.join(DEPTH_ENCODERS)}"
-        )
+        raise unknown_suffix(path, "not a name for a depth map", [*DEPTH_ENCODERS])
     return encoder
 
 

@@ -22,7 +22,7 @@ from spackle.formats.sog import META_NAME, encode_sog
 from spackle.formats.sog_reader import is_sog_archive, read_sog, sog_byte_count
 from spackle.formats.splat import decode_splat, encode_splat
 from spackle.formats.spz import decode_spz, encode_spz, encode_spz_4
-from spackle.runtime.errors import InputError, as_input_error, printable_line
+from spackle.runtime.errors import InputError, as_input_error, printable_line, unknown_suffix
 from spackle.runtime.files import check_file
 
 Encoder = Callable[[SceneFile], bytes]
@@ -212,4 +212,4 @@ def encoder_for(path: Path, more_encoders: Mapping[str, Encoder] | None = None) 
     for suffix, encoder in encoders.items():
         if path.name.lower().endswith(suffix):
             return encoder
-    raise InputError(f"{path}: which format? Give a name that ends in {', '.join(encoders)}")
+    raise unknown_suffix(path, "which format", [*encoders])

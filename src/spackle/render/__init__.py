@@ -16,7 +16,7 @@ from spackle.render.cpu import CpuRenderer
 from spackle.render.drawing import touched_tiles
 from spackle.render.gsplat_backend import GsplatRenderer
 from spackle.render.protocol import TILE_PX, Renderer
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, check_name
 
 __all__ = ["TILE_PX", "CpuRenderer", "Renderer", "get_renderer", "touched_tiles"]
 
@@ -31,8 +31,7 @@ def get_renderer(device: str = "auto") -> Renderer:
     Raises:
         InputError: the device is unknown, or "cuda" cannot render on this machine.
     """
-    if device not in ("auto", "cpu", "cuda"):
-        raise InputError(f"`device` {device}: unknown device; use auto, cpu or cuda")
+    check_name("device", device, ("auto", "cpu", "cuda"))
 
     if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         try:

@@ -30,7 +30,7 @@ from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
 from spackle.formats.stored_precision import count_coarse
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio
-from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.errors import InputError, as_input_error, unknown_suffix
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Progress, Reporter
@@ -276,10 +276,7 @@ def _check_is_folder_name(output: Path) -> None:
     """
     mime_type = mimetypes.guess_type(output.name)[0] or ""  # such as "video/x-msvideo"
     if mime_type.startswith(("video/", "image/")):
-        raise InputError(
-            f"{output}: not a kind of video that can be written: "
-            f"end the name with {', '.join(VIDEO_FORMATS)}"
-        )
+        raise unknown_suffix(output, "not a kind of video that can be written", [*VIDEO_FORMATS])
 
 
 def _sets_to_render(scene: Scene, scene_file: Path, *, compare: bool) -> list[list[Gaussians]]:

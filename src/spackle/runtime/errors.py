@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import re
 import reprlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
-from spackle.runtime.suggestions import closest_name
+from spackle.runtime.suggestions import closest_name, closest_suffix, question
 
 Result = TypeVar("Result")
 
@@ -74,8 +74,7 @@ def _suggested_value(problem: Any) -> str:
     """
     # Pydantic gives the values as a text: "'resnet50', 'squeezenet' or 'none'".
     values = re.findall(r"'([^']*)'", problem["ctx"]["expected"])
-    suggestion = closest_name(str(problem["input"]), values)
-    return "" if suggestion is None else f": did you mean {suggestion}?"
+    return question(closest_name(str(problem["input"]), values))
 
 
 @contextlib.contextmanager
@@ -162,8 +161,30 @@ def check_name(option: str, name: str, known: Iterable[str]) -> None:
     names = list(known)
     if name in names:
         return
-    problem = f"`{option}` {name} is unknown"
-    suggestion = closest_name(name, names)
-    if suggestion is not None:
-        raise InputError(f"{problem}: did you mean {suggestion}? There are {', '.join(names)}")
-    raise InputError(f"{problem}: there are {', '.join(names)}")
+    raise InputError(f"`{option}` {name} is {unknown_name(name, names)}")
+
+
+def unknown_name(name: str, known: Sequence[str]) -> str:
+    """What a message says of a name that is none of the known ones, with what was probably meant.
+
+    For example "unknown: did you mean sharp? There are sharp, moge, lite".
+    """
+    suggestion = closest_name(name, known)
+    if suggestion is None:
+        return f"unknown: there are {', '.join(known)}"
+    return f"unknown{question(suggestion)} There are {', '.join(known)}"
+
+
+def unknown_suffix(file: object, problem: str, known: Sequence[str]) -> InputError:
+    """The error for a file's name whose suffix says no kind of file that can be written.
+
+    Args:
+        file: the file, which the message begins with.
+        problem: what is wrong, such as "not a name for a video".
+        known: the suffixes that can be written.
+    """
+    meant = question(closest_suffix(str(file), known))
+    advice = f"end the name with {', '.join(known)}"
+    if not meant:
+        return InputError(f"{file}: {problem}: {advice}")
+    return InputError(f"{file}: {problem}{meant} Else {advice}")

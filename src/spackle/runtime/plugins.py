@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from spackle.runtime.errors import InputError, check_name, reason_in_a_line
-from spackle.runtime.suggestions import closest_name
+from spackle.runtime.suggestions import closest_name, question
 
 PLUGIN_FORM = "package.module:Name"
 
@@ -67,8 +67,8 @@ def load_plugin(name: str, option: str, *, needs: Sequence[str] = (), like: str 
         raise InputError(f"`{option}` {name}: give a built-in name, or {PLUGIN_FORM}")
     module = _import_module(module_name, f"`{option}` {name}")
     if not hasattr(module, attribute):
-        question = _question(attribute, vars(module))
-        raise InputError(f"`{option}` {name}: {module_name} has no {attribute}{question}")
+        meant = question(closest_name(attribute, vars(module)))
+        raise InputError(f"`{option}` {name}: {module_name} has no {attribute}{meant}")
 
     plugin = getattr(module, attribute)
     for needed_name in needs:
@@ -127,11 +127,11 @@ def _import_module(module_name: str, where: str) -> ModuleType:
     except InputError:  # has a message for the user already
         raise
     except Exception as error:  # a module can raise any exception while it is imported
-        question = ""
+        meant = ""
         if isinstance(error, ModuleNotFoundError) and error.name == module_name:
-            question = _question(module_name, _modules_beside(module_name))
+            meant = question(closest_name(module_name, _modules_beside(module_name)))
         reason = reason_in_a_line(error)
-        raise InputError(f"{where}: cannot import {module_name}: {reason}{question}") from error
+        raise InputError(f"{where}: cannot import {module_name}: {reason}{meant}") from error
 
 
 def _modules_beside(module_name: str) -> list[str]:
@@ -141,9 +141,3 @@ def _modules_beside(module_name: str) -> list[str]:
     if package_name:
         folders = getattr(sys.modules.get(package_name), "__path__", [])
     return [f"{package_name}{dot}{module.name}" for module in pkgutil.iter_modules(folders)]
-
-
-def _question(name: str, known: Iterable[str]) -> str:
-    """The end of a message, such as ": did you mean my_base?"; "" if no name is similar."""
-    suggestion = closest_name(name, known)
-    return "" if suggestion is None else f": did you mean {suggestion}?"

@@ -24,6 +24,20 @@ def closest_name(name: str, known_names: Iterable[str]) -> str | None:
     return by_lower_case[similar[0]] if similar else None
 
 
+def closest_suffix(file_name: str, known_suffixes: Iterable[str]) -> str | None:
+    """The known suffix, such as ".ply", that the end of a file's name probably means; else None."""
+    # Without the dot, which all suffixes share. Of .compressed.ply and .ply the last one counts.
+    by_letters = {suffix.rpartition(".")[2]: suffix for suffix in known_suffixes}
+    written = file_name.rpartition(".")[2]
+    closest = closest_name(written, by_letters) if "." in file_name else None
+    return None if closest is None else by_letters[closest]
+
+
+def question(suggestion: str | None) -> str:
+    """The middle or end of a message, ": did you mean sharp?"; "" without a suggestion."""
+    return "" if suggestion is None else f": did you mean {suggestion}?"
+
+
 def closest_key(key: str, known_keys: Sequence[str]) -> str | None:
     """The known key that was probably meant, such as optim.lr for optim.learning_rate.
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from spackle.runtime.errors import MAX_VALUE_LENGTH, InputError, first_validation_problem
-from spackle.runtime.suggestions import closest_key
+from spackle.runtime.suggestions import closest_key, question
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -18,23 +18,29 @@ Model = TypeVar("Model", bound=BaseModel)
 def validated(model: type[Model], content: Any, where: object) -> Model:
     """The content of a file as a model; InputError, which begins with `where`, if it is none.
 
-    The message names the first wrong key. For an unknown key it suggests the known one that was
-    probably meant, or else lists what there is in its section.
+    The message is that of `validation_problem`.
     """
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        problems = error.errors()
-        # A key with a typing error also lacks where it should be; the error tells more.
-        unknown_keys = [one for one in problems if one["type"] == "extra_forbidden"]
-        first = problems[0]
-        if first["type"] == "missing" and unknown_keys:
-            first = unknown_keys[0]
-        if first["type"] == "extra_forbidden":
-            problem = _unknown_key(model, first["loc"], first["input"])
-        else:
-            problem = first_validation_problem(error)
-        raise InputError(f"{where}: {problem}") from error
+        raise InputError(f"{where}: {validation_problem(model, error)}") from error
+
+
+def validation_problem(model: type[BaseModel], error: ValidationError) -> str:
+    """The first wrong key of what was checked against a model, and what is wrong with it.
+
+    For an unknown key it suggests the known one that was probably meant, or else lists what there
+    is in its section.
+    """
+    problems = error.errors()
+    # A key with a typing error also lacks where it should be; the error tells more.
+    unknown_keys = [one for one in problems if one["type"] == "extra_forbidden"]
+    first = problems[0]
+    if first["type"] == "missing" and unknown_keys:
+        first = unknown_keys[0]
+    if first["type"] == "extra_forbidden":
+        return _unknown_key(model, first["loc"], first["input"])
+    return first_validation_problem(error)
 
 
 def _unknown_key(model: type[BaseModel], location: Sequence[int | str], value: Any) -> str:
@@ -53,9 +59,12 @@ def _unknown_key(model: type[BaseModel], location: Sequence[int | str], value: A
     problem = f"{'.'.join(path)}: there is no such key"
 
     known_keys = _dotted_keys(model, location)
-    suggestion = closest_key(".".join(path), known_keys)
+    sections = [
+        name for name, field in model.model_fields.items() if _model_in(field.annotation)[0]
+    ]
+    suggestion = closest_key(".".join(path), known_keys) or closest_key(".".join(path), sections)
     if suggestion is not None:
-        return f"{problem}: did you mean {suggestion}?"
+        return f"{problem}{question(suggestion)}"
     # Otherwise what there is in the section: its own keys, and the names of the sections in it.
     section = "".join(f"{part}." for part in location[:-1])
     neighbours = [key.removeprefix(section) for key in known_keys if key.startswith(section)]

@@ -7,7 +7,7 @@ import math
 import os
 from pathlib import Path
 
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, unknown_suffix
 
 DEFAULT_FPS = 30
 
@@ -119,8 +119,7 @@ def check_video(path: StrPath, fps: float, loop: int | None = None) -> VideoForm
     """
     video_format = VIDEO_FORMATS.get(Path(path).suffix.lower())
     if video_format is None:
-        suffixes = ", ".join(VIDEO_FORMATS)
-        raise InputError(f"{path}: not a name for a video: end it with {suffixes}")
+        raise unknown_suffix(path, "not a name for a video", [*VIDEO_FORMATS])
     check_fps(path, fps, video_format)
     if loop is not None:
         check_loop(path, loop, video_format)

@@ -22,7 +22,8 @@ from spackle.core.image_formats import (
 )
 from spackle.depth.readers import DEPTH_SUFFIXES
 from spackle.formats.camera_files import CameraEntry, camera_from_json
-from spackle.runtime.errors import InputError, first_validation_problem, printable_line
+from spackle.runtime.errors import InputError, printable_line, unknown_name
+from spackle.runtime.validation import validation_problem
 from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, sent_mask
 from spackle.web.jobs import Edit, Job, Jobs
 from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions, check_photo
@@ -206,7 +207,7 @@ def _edit_options(form: FormData, model: type[MODEL]) -> MODEL:
     try:
         return model.model_validate_json(text)
     except ValidationError as error:
-        problem = printable_line(f"options: {first_validation_problem(error)}")
+        problem = printable_line(f"options: {validation_problem(model, error)}")
         raise HTTPException(422, problem) from error
 
 
@@ -267,12 +268,11 @@ def read_options(text: str, bases: list[str]) -> SceneOptions:
     try:
         options = SceneOptions.model_validate_json(text)
     except ValidationError as error:
-        problem = printable_line(f"options: {first_validation_problem(error)}")
+        problem = printable_line(f"options: {validation_problem(SceneOptions, error)}")
         raise HTTPException(422, problem) from error
 
     if options.base is not None and options.base not in bases:
-        unknown = f"unknown: there are {', '.join(bases)}"
-        reason = MISSING_WEIGHTS_ADVICE.get(options.base, unknown)
+        reason = MISSING_WEIGHTS_ADVICE.get(options.base) or unknown_name(options.base, bases)
         raise HTTPException(422, printable_line(f"base {options.base} on this server: {reason}"))
     return options
 
