@@ -297,15 +297,16 @@ def test_a_photo_is_sent_to_the_server_watched_and_dragged(browser: Any, tmp_pat
     with served(tmp_path / "scenes", work=SceneWork(), max_bytes=MAX_UPLOAD_BYTES) as server:
         address = f"http://127.0.0.1:{server.port}{server.root}/"
         page = (found := opened(browser, address)).page
-        page.get_by_role("button", name="Choose a photo…").click()
         page.locator("summary").click()
         page.locator("[name=depth]").set_input_files(depth)
         page.locator("[name=depth_kind]").select_option("near-white")
         assert not page.locator("[name=depth_unit]").is_visible()  # relative depth has no unit
         page.locator("[name=depth_kind]").select_option("metric")
         page.locator("[name=depth_unit]").fill("cm")
-        page.locator("#file").set_input_files(photo)
-        page.get_by_role("button", name="Start").click()
+        with page.expect_file_chooser() as chooser:  # the system's own dialog, and no other one
+            page.get_by_role("button", name="Choose photos…").click()
+        assert chooser.value.is_multiple()
+        chooser.value.set_files(photo)
         page.locator("#frame.waiting #photo").wait_for()  # the picture stands where the scene will
         page.get_by_role("heading", name="my photo.png").wait_for()
         page.locator("#notice").wait_for(state="hidden")
@@ -323,11 +324,11 @@ def test_a_photo_is_sent_to_the_server_watched_and_dragged(browser: Any, tmp_pat
         page.reload()
         settled(page, "spackle.ready")
         assert page.title() == "my photo.png · Spackle"
-        page.get_by_role("button", name="Open a photo").click(force=True)
-        page.locator("#file").set_input_files(
+        with page.expect_file_chooser() as chooser:
+            page.get_by_role("button", name="Open photos").click(force=True)
+        chooser.value.set_files(
             {"name": "rough.png", "mimeType": "image/png", "buffer": b"no photo"}
         )
-        page.get_by_role("button", name="Start").click()
         page.get_by_text("rough.png: not an image").wait_for()
         assert [line for line in found.said if "415" not in line] == []
         assert all(

@@ -69,8 +69,8 @@ export function cameraAt(description, eye, { scale, x, y } = { scale: 1, x: 0, y
 }
 
 /**
- * The buttons that change the scene. `page` has say(text), progress(stage, share), begin(id) and end(): the page
- * follows one piece of work at a time, and may stop it.
+ * The buttons that change the scene. `page` has say(text), progress(stage, share), begin(id), end() and swapped(from, to):
+ * the page follows one piece of work at a time, and may stop it.
  */
 export class Edits {
   constructor(viewer, page) {
@@ -119,7 +119,7 @@ export class Edits {
 
   key(event) {
     const { key, target } = event;
-    if (element("choices").open || element("edits").hidden) return;
+    if (element("edits").hidden || element("edits").inert) return;
     if (key === "Escape" && this.brush.open && !this.busy) return this.paint(false);
     const types = target.matches?.("input:not([type=range]), select, textarea");
     if (!(event.ctrlKey || event.metaKey) || event.altKey || types || this.busy) return;
@@ -220,6 +220,7 @@ export class Edits {
   /** Put another state of the scene in the place of this one: nobody moves, nothing flickers. */
   async swap(id) {
     const { description, layers } = await source.load(id);
+    this.page.swapped(this.viewer.id, id);
     await this.viewer.replace(description, layers, id);
     history.replaceState({ redo: this.redoable }, "", `#${id}`);
     await this.learn(id);

@@ -2,6 +2,7 @@
 import { control } from "./controls.js";
 import { cameraAt, Edits } from "./edits.js";
 import { divider, fit, panel, roomy, unfold } from "./panel.js";
+import { Queue } from "./queue.js";
 import * as source from "./source.js";
 import { KINDS, Viewer } from "./viewer.js";
 import { eyeOnPath, lookingAxes } from "./views.js";
@@ -15,15 +16,19 @@ const BASES = { auto: "the best that is here", sharp: "SHARP", moge: "MoGe-2", d
 const element = (id) => document.getElementById(id);
 const viewer = started();
 let upload = null; // what the server takes, where there is one
-let working = null; // the scene that is waited for
+let watched = null; // the photo whose progress the page shows
+let editing = null; // the id of the scene that an edit makes
+let opening = 0; // counts the scenes that were asked for: only the last one is shown
 let edits = null;
+let queue = null;
 
 if (viewer) {
   control(viewer.canvas, viewer);
   panel(viewer, say);
   divider(viewer);
+  queue = new Queue(element("queue"), { work, ended, pick, stop, shows, resized: () => fit(viewer) });
+  edits = new Edits(viewer, { say, progress, begin: (id) => (editing = id), end, swapped });
   uploads();
-  edits = new Edits(viewer, { say, progress, begin: (id) => (working = id), end });
   const ready = first();
   ready.catch((error) => notice("Nothing to show", error.message));
   window.spackle = scripting(ready);
@@ -50,10 +55,15 @@ async function first() {
   if (upload) element("file").accept = ["image/*", ...upload.suffixes].join(",");
   const bases = (upload?.bases ?? []).map((name) => new Option(BASES[name] ?? name, name));
   element("choices").querySelector("[name=base]").replaceChildren(...bases);
-  addEventListener("hashchange", () => chosen() && chosen() !== viewer.id && watch(chosen()));
-  if (chosen()) return watch(chosen());
+  addEventListener("hashchange", () => chosen() && chosen() !== viewer.id && visit(chosen()));
   for (const button of document.querySelectorAll("[data-example]")) button.firstChild.src = source.here(`/${button.dataset.example}`);
-  notice("Step into your photo", upload ? `${matchMedia("(hover: hover)").matches ? "Drop a photo here, or choose one" : "Choose a photo"}, and look behind what stands in front.` : "The address names no scene.");
+  return chosen() ? visit(chosen()) : start();
+}
+
+/** The page without a scene. */
+function start() {
+  const way = matchMedia("(hover: hover)").matches ? "Drop a photo here, or choose one" : "Choose a photo";
+  notice("Step into your photo", upload ? `${way}, and look behind what stands in front.` : "The address names no scene.");
   element("notice").classList.add("empty");
 }
 
@@ -68,6 +78,7 @@ async function show({ description, layers }, id = null) {
   document.title = `${description.name} · Spackle`;
   element("frame").hidden = false;
   element("frame").classList.add("waiting");
+  element("open").after(element("choices"));
   document.body.classList.remove("idle");
   fit(viewer);
   if (roomy()) unfold(true);
@@ -80,101 +91,206 @@ async function show({ description, layers }, id = null) {
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
 }
 
-/** Follow a photo to its scene; the photo stands in its place meanwhile. */
-async function watch(id) {
-  working = id;
-  viewer.playing = false; // the processor is needed elsewhere
-  if (chosen() !== id) history.replaceState(null, "", `#${id}`); // else what can be done again stays
-  progress(null, null);
+/** Show a scene of the server, which may still be in work. */
+async function visit(id) {
+  const known = queue.withId(id);
+  if (known) return pick(known);
   try {
-    if (!stand.url && (await source.state(id)).files.includes("photo.jpg")) stand(source.file(id, "photo.jpg"));
-    await source.follow(id, ({ stage, share }) => progress(stage, share));
-    await show(await source.load(id, (share) => progress("load", share)), id);
+    const { name, files } = await source.state(id);
+    const item = { id, name, url: files.includes("photo.jpg") ? source.file(id, "photo.jpg") : null, watch: true };
+    await queue.adopt(item);
   } catch (error) {
     failed(error);
   }
-  working = null;
+}
+
+/** Have the server make the scene of a photo. */
+async function work(item) {
+  if (item.watch || !viewer.description) watch(item);
+  const stopped = new Promise((_, reject) => (item.end = () => reject(new Error("Stopped"))));
+  stopped.catch(() => {});
+  await Promise.race([made(item), stopped]);
+}
+
+async function made(item) {
+  const { file } = item;
+  if (!item.id) {
+    // What the file is, the server sees in its content; only what is surely no photo stays here.
+    if (/^(video|audio|text)\//.test(file.type)) throw new Error(`${file.name}: not a photo`);
+    if (file.size > upload.max_bytes) throw new Error(`${file.name} is larger than ${Math.floor(upload.max_bytes / 1e6)} MB`);
+    item.id = await source.send(file, item.options);
+    if (item.stopped) return source.remove(item.id);
+    if (watched === item) named(item.id);
+  }
+  await source.follow(item.id, (news) => {
+    item.news = news;
+    if (watched === item) progress(news.stage, news.share);
+  });
+}
+
+/** The work on a photo is over: show its scene, if somebody waits for it, or say why there is none. */
+async function ended(item) {
+  const isWatched = watched === item;
+  if (item.state === "done") return isWatched && showScene(item);
+  if (isWatched) leave();
+  if (!isWatched) return say(item.stopped ? "Stopped" : item.line);
+  if (!item.stopped) return failed(new Error(item.line));
+  if (viewer.description) restore();
+  else start();
+  say("Stopped");
+}
+
+/** A person has clicked a photo of the queue. */
+function pick(item) {
+  if (edits.busy) return say("One moment: the scene is being changed.");
+  if (item.state === "done") return showScene(item);
+  if (item.state === "working") return watch(item);
+  say(item.line || `${item.name}: waiting for its turn`);
+}
+
+function stop(item) {
+  item.stopped = true;
+  item.end?.();
+  if (item.id) source.remove(item.id).catch((error) => say(error.message));
+}
+
+/** Whether the page shows this photo, or its scene. */
+function shows(item) {
+  return watched ? watched === item : Boolean(item.id) && item.id === viewer?.id;
+}
+
+/** Show the progress of a photo; the photo stands in the scene's place meanwhile. */
+function watch(item) {
+  watched = item;
+  viewer.playing = false; // the processor is needed elsewhere
+  element("edits").inert = true; // they are of a scene that is not seen now
+  if (item.id) named(item.id);
+  stand(item);
+  progress(item.news?.stage ?? null, item.news?.share ?? null);
+  queue.draw();
+}
+
+/** Nobody waits for a photo any longer. */
+function leave() {
+  watched = null;
+  element("edits").inert = false;
   stand(null);
+  queue.draw();
+}
+
+async function showScene(item) {
+  const mine = ++opening;
+  if (!watched) watch(item);
+  try {
+    const scene = await source.load(item.id, (share) => mine === opening && progress("load", share));
+    if (mine !== opening) return;
+    named(item.id);
+    await show(scene, item.id);
+    if (mine === opening) leave();
+  } catch (error) {
+    if (mine !== opening) return;
+    leave();
+    failed(error);
+  }
+}
+
+/** The address names a scene; what can be done again stays, if it is that of the same scene. */
+function named(id) {
+  if (chosen() !== id) history.replaceState(null, "", `#${id}`);
 }
 
 /** The work on a scene that is shown is over. */
 function end() {
-  working = null;
+  editing = null;
   element("notice").hidden = true;
 }
 
-/** Show a picture until the scene is there. */
-function stand(url) {
+/** An edit has put another scene in the place of one. */
+function swapped(from, to) {
+  const item = queue.withId(from);
+  if (item) item.id = to;
+}
+
+/** Show the picture of a photo until its scene is there; null: no longer. */
+function stand(item) {
   const photo = element("photo");
-  if (stand.url?.startsWith("blob:")) URL.revokeObjectURL(stand.url);
-  stand.url = url;
+  const url = item?.url;
   if (!url) return;
   photo.onload = () => {
+    if (watched !== item) return;
     element("frame").hidden = false;
     element("frame").classList.add("waiting");
     fit(viewer, { width: photo.naturalWidth, height: photo.naturalHeight });
   };
-  photo.onerror = () => url.startsWith("blob:") && /^[0-9a-f]{16}$/.test(working) && stand(source.file(working, "photo.jpg"));
+  // Not every browser shows every kind of photo; the server makes a JPEG of each.
+  photo.onerror = async () => {
+    if (!url.startsWith("blob:")) return;
+    while (watched === item && !item.id) await new Promise((resolve) => setTimeout(resolve, 200));
+    if (watched !== item) return;
+    item.url = source.file(item.id, "photo.jpg");
+    stand(item);
+  };
   photo.src = url;
 }
 
-async function open(photo) {
-  if (!photo || working) return;
-  // What the file is, the server sees in its content; only what is surely no photo stays here.
-  if (/^(video|audio|text)\//.test(photo.type)) return say(`${photo.name}: not a photo`);
-  if (photo.size > upload.max_bytes) return say(`${photo.name} is larger than ${Math.floor(upload.max_bytes / 2 ** 20)} MB`);
-  working = "…";
-  stand(URL.createObjectURL(photo));
-  progress(null, null);
-  try {
-    await watch(await source.send(photo, choices()));
-  } catch (error) {
-    failed(error);
-  }
-  working = null;
-  stand(null);
+/** Queue photos; what the options say holds for them. */
+function take(files) {
+  if (!upload) return say("This page shows its scene, and takes no photos.");
+  const options = choices();
+  element("choices").open = false;
+  const isIdle = !watched && !edits.busy && !queue.sending;
+  queue.add([...files].map((file, index) => ({
+    name: file.name, file, url: URL.createObjectURL(file), watch: isIdle && index === 0,
+    options: index ? { ...options, depth: null } : options, // a depth map is of one photo
+  })));
+  if (options.depth?.size && files.length > 1) say(`The depth map goes with ${files[0].name}.`);
 }
 
 function uploads() {
   const file = element("file");
-  const dialog = element("choices");
-  const start = element("start");
-  for (const button of document.querySelectorAll("[data-do=open]")) button.onclick = () => dialog.showModal();
+  for (const button of document.querySelectorAll("[data-do=open]")) button.onclick = () => file.click();
   for (const button of document.querySelectorAll("[data-example]")) button.onclick = () => example(button.dataset.example);
-  element("stop").onclick = () => source.remove(working).catch((error) => say(error.message));
-  file.onchange = () => {
-    start.disabled = !file.files[0];
-    if (!dialog.open) take();
+  element("stop").onclick = () => {
+    if (editing) source.remove(editing).catch((error) => say(error.message));
+    else if (watched) stop(watched);
   };
-  start.onclick = take;
-  const elements = dialog.querySelector("form").elements;
+  file.onchange = () => {
+    if (file.files.length) take([...file.files]);
+    file.value = "";
+  };
+  const { elements } = element("choices").querySelector("form");
+  viewer.canvas.addEventListener("pointerdown", () => document.body.classList.contains("idle") || (element("choices").open = false));
   elements.depth.onchange = elements.depth_kind.onchange = offerReadings;
-  const holdsFile = (event) => upload && !working && event.dataTransfer?.types.includes("Files");
   addEventListener("dragover", (event) => {
     event.preventDefault();
-    if (holdsFile(event)) document.body.classList.add("dropping");
+    if (upload && event.dataTransfer?.types.includes("Files")) document.body.classList.add("dropping");
   });
   addEventListener("dragleave", (event) => event.relatedTarget || document.body.classList.remove("dropping"));
   addEventListener("drop", (event) => {
     event.preventDefault();
     document.body.classList.remove("dropping");
-    if (!holdsFile(event)) return;
-    if (dialog.open) dialog.close();
-    open(event.dataTransfer.files[0]);
+    dropped(event.dataTransfer);
   });
+  addEventListener("paste", (event) => {
+    if (event.target.matches?.("input:not([type=range]), textarea")) return;
+    const files = [...event.clipboardData.files];
+    if (files.length) take(files.map((each) => (each.name === "image.png" ? new File([each], "Pasted picture.png", { type: each.type }) : each)));
+    else if (upload) say("The clipboard holds no picture.");
+  });
+}
 
-  function take() {
-    dialog.close();
-    open(file.files[0]);
-    file.value = "";
-    start.disabled = true;
-  }
+function dropped(transfer) {
+  const files = [...transfer.files];
+  const folder = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).find((entry) => entry?.isDirectory);
+  if (folder) return say(`${folder.name} is a folder: drop the photos in it.`);
+  if (!files.length) return say("Only files can be dropped here: save the picture first, or copy it and press Ctrl+V.");
+  take(files);
 }
 
 /** One of the photos that come with the page. */
 async function example(name) {
   const photo = await (await fetch(source.here(`/${name}`))).blob();
-  open(new File([photo], name, { type: photo.type }));
+  take([new File([photo], name, { type: photo.type })]);
 }
 
 /** Show how a depth map may be read: its kind, and for distances the unit. */
@@ -184,7 +300,7 @@ function offerReadings() {
   element("unit").hidden = !depth.files[0] || !["", "metric"].includes(kind.value);
 }
 
-/** What the dialog says: {base, disparity, depth, depth_kind, depth_unit}. */
+/** What the options say: {base, disparity, depth, depth_kind, depth_unit}. */
 function choices() {
   const form = element("choices").querySelector("form");
   const said = Object.fromEntries(new FormData(form));
@@ -196,11 +312,13 @@ function choices() {
 
 function notice(title, text, busy = false) {
   const box = element("notice");
+  if (!busy && !viewer?.description) element("frame").hidden = true;
   box.hidden = false;
   box.classList.remove("empty");
   box.classList.toggle("busy", busy);
   box.classList.toggle("may-open", !busy && Boolean(upload));
-  box.classList.toggle("may-stop", busy && Boolean(upload) && /^[0-9a-f]{16}$/.test(working));
+  box.classList.toggle("may-stop", busy && Boolean(upload) && Boolean(editing || watched));
+  if (!busy) box.append(element("choices"));
   box.querySelector("h2").textContent = title;
   box.querySelector("p").textContent = text;
 }
@@ -214,16 +332,20 @@ function progress(stage, share) {
 }
 
 function failed(error) {
-  element("frame").classList.remove("waiting");
   if (viewer.description) {
-    history.replaceState(null, "", `#${viewer.id ?? ""}`);
-    element("notice").hidden = true;
-    fit(viewer);
+    restore();
     say(error.message);
   } else {
-    element("frame").hidden = true;
     notice("That did not work", error.message);
   }
+}
+
+/** Show the former scene again. */
+function restore() {
+  element("frame").classList.remove("waiting");
+  element("notice").hidden = true;
+  history.replaceState(history.state, "", `#${viewer.id ?? ""}`);
+  fit(viewer);
 }
 
 function say(text, stay = false) {
