@@ -15,8 +15,10 @@ from spackle.cli.options import (
     DepthUnitOption,
     DeviceOption,
     PrecisionOption,
+    RayOption,
     SharpTrajectoryName,
     VerboseOption,
+    WorkersOption,
 )
 
 dataset = typer.Typer(
@@ -115,18 +117,14 @@ def dataset_build(
             "lama 1024."
         ),
     ] = None,
-    workers: Annotated[
-        int,
-        typer.Option(
-            min=1, max=1024, help="Number of processes, each with a copy of the base's network."
-        ),
-    ] = 1,
+    workers: WorkersOption = None,
     threads: Annotated[
         int,
         typer.Option(
             min=1, max=1024, help="Threads of each process; the number changes SHARP's last bits."
         ),
     ] = 2,
+    ray: RayOption = None,
     shard_size: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")
     ] = 50,
@@ -166,6 +164,7 @@ def dataset_build(
         inpainter_side=inpainter_side,
         workers=workers,
         threads=threads,
+        ray=ray,
         shard_size=shard_size,
     )
     # Ctrl-C or SIGTERM: finished photos are saved, and the same command resumes the build.

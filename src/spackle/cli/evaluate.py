@@ -29,8 +29,11 @@ from spackle.cli.options import (
     DeviceOption,
     JsonOption,
     PrecisionOption,
+    RayOption,
     SharpWindowsOption,
+    ThreadsOption,
     VerboseOption,
+    WorkersOption,
 )
 
 
@@ -98,6 +101,9 @@ def evaluate(
         ),
     ] = False,
     device: DeviceOption = "auto",
+    workers: WorkersOption = None,
+    threads: ThreadsOption = None,
+    ray: RayOption = None,
     output: ResultsOption = None,
     html: HtmlOption = False,
     as_json: JsonOption = False,
@@ -141,6 +147,9 @@ def evaluate(
         features=features,
         limit=limit,
         download_metrics=download_metrics,
+        workers=workers,
+        threads=threads,
+        ray=ray,
     )
     # The folder has the protocol in its name, so that runs of both protocols do not meet in it.
     results = output or results_name("evaluation", dataset, protocol)

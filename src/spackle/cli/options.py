@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -32,10 +34,67 @@ METHODS = "base, paper-initial, paper, spackle, spackle-scene, initial, dense, i
 METRICS = "clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips"
 WEIGHTS = "depth (MoGe-2), sharp, lama, features or squeezenet"
 
+DEVICE_NAME = re.compile(r"auto|cpu|cuda(:(?P<number>[0-9]{1,3}))?")
+
 # The machine.
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]
+
+
+def _device(name: str) -> str:
+    """The device without the number of a GPU, which becomes the only one that torch sees.
+
+    So all that runs in this process, and in processes that it starts, uses this GPU. InputError for
+    an unknown name.
+    """
+    match = DEVICE_NAME.fullmatch(name)
+    if match is None:
+        raise InputError(f"--device {name}: give auto, cpu, cuda, or one GPU such as cuda:1")
+    if match["number"] is None:
+        return name
+    # The number counts the GPUs that the user has made visible, as torch counts them.
+    number = int(match["number"])
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    gpus = str(number) if visible is None else ",".join(visible.split(",")[number : number + 1])
+    os.environ["CUDA_VISIBLE_DEVICES"] = gpus
+    return "cuda"
+
+
 DeviceOption = Annotated[
-    Literal["auto", "cpu", "cuda"], typer.Option(help="Device of networks and renderer.")
+    str,
+    typer.Option(
+        metavar="auto|cpu|cuda|cuda:N",
+        callback=_device,
+        help="Device of networks and renderer; cuda:1: the second GPU.",
+    ),
+]
+# Several processes, on this machine or on a cluster.
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=1024,
+        help="Number of processes, each with a copy of the networks; default: one for each GPU, "
+        "or one; with --ray as many as there is room for.",
+        show_default=False,
+    ),
+]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(
+        hidden=True,
+        min=1,
+        max=1024,
+        help="Threads of each process; the last bits of a network's output depend on their number.",
+        show_default="the cores, shared evenly; with --ray 2",
+    ),
+]
+RayOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto|HOST:PORT|local",
+        help="Work on the machines of a Ray cluster; auto: of the one that this machine belongs "
+        "to; see docs/scale.md.",
+    ),
 ]
 SharpWindowsOption = Annotated[
     int | None,

@@ -30,14 +30,17 @@ from spackle.cli.options import (
     OverscanOption,
     PathFileOption,
     PrecisionName,
+    RayOption,
     SecondsOption,
     SharpWindowsOption,
     ShowOption,
     SizeOption,
     StereoOption,
+    ThreadsOption,
     TrajectoryOption,
     VerboseOption,
     VideoFormatOption,
+    WorkersOption,
     path_options,
 )
 from spackle.runtime.errors import InputError
@@ -115,6 +118,7 @@ def predict(
     checkpoint: CheckpointOption = None,
     precision: Annotated[
         PrecisionName,
+        RayOption,
         typer.Option(
             hidden=True,
             help="Precision of the base's network; auto: bf16 if the hardware supports it.",
@@ -199,27 +203,9 @@ def predict(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Predict again even if results exist.")
     ] = False,
-    workers: Annotated[
-        int,
-        typer.Option(
-            hidden=True,
-            min=1,
-            max=1024,
-            help="Number of processes that share the photos, each with its own copy of the base's "
-            "network.",
-        ),
-    ] = 1,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            hidden=True,
-            min=1,
-            max=1024,
-            help="Threads of each worker; the last bits of a network's output depend on their "
-            "number.",
-            show_default="the cores, shared evenly",
-        ),
-    ] = None,
+    workers: WorkersOption = None,
+    threads: ThreadsOption = None,
+    ray: RayOption = None,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
     help_all: HelpAllOption = False,
@@ -286,6 +272,7 @@ def predict(
         overwrite=overwrite,
         workers=workers,
         threads=threads,
+        ray=ray,
     )
     reporter = CommandReporter(verbose, as_json=as_json)
     if posed is not None:

@@ -37,13 +37,15 @@ RESULT_FILES = (VIDEO_FILE, REPORT_FILE)
 FRAME_NAME = "{:06d}"
 
 
-def clip_options(scene: PipelineOptions, photo: PhotoOptions, workers: int) -> PipelineOptions:
+def clip_options(
+    scene: PipelineOptions, photo: PhotoOptions, workers: int | None
+) -> PipelineOptions:
     """The pipeline's options for a clip.
 
     Args:
         scene: the options as the user gave them.
         photo: options of reading and writing a photo, most of which do not apply to a clip.
-        workers: number of processes that the user wants.
+        workers: number of processes that the user wants; None: no wish.
 
     Raises:
         InputError: an option does not apply to a clip, or OpenCV, which finds the motion, is not
@@ -60,7 +62,9 @@ def clip_options(scene: PipelineOptions, photo: PhotoOptions, workers: int) -> P
     return dataclasses.replace(scene, fill=network_fill)
 
 
-def _check_options_suit_clips(scene: PipelineOptions, photo: PhotoOptions, workers: int) -> None:
+def _check_options_suit_clips(
+    scene: PipelineOptions, photo: PhotoOptions, workers: int | None
+) -> None:
     """Raise an InputError for an option that does not apply to a clip.
 
     `scene` and `photo` are the user's options; `workers` is the number of processes.
@@ -90,7 +94,7 @@ def _check_options_suit_clips(scene: PipelineOptions, photo: PhotoOptions, worke
         unsuitable.append("depth_out")
     if not photo.render:
         unsuitable.append("no_render")
-    if workers > 1:
+    if (workers or 1) > 1:
         unsuitable.append("workers")
     if unsuitable:
         raise InputError(

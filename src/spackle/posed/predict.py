@@ -174,8 +174,10 @@ def _check_options_suit(options: PredictOptions) -> None:
         unsuitable.append("depth_out")
     if options.photo.keep_base:
         unsuitable.append("keep_base")
-    if options.workers > 1:
+    if (options.workers or 1) > 1:
         unsuitable.append("workers")
+    if options.ray is not None:
+        unsuitable.append("ray")
     if unsuitable:
         raise InputError(
             f"`{unsuitable[0]}`: not with `posed`, whose photos and cameras say it: "

@@ -11,6 +11,7 @@ import functools
 import glob
 import os
 import shlex
+import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -31,7 +32,6 @@ from spackle.results.photo_folder import (
     predict_photo,
     read_earlier_report,
 )
-from spackle.runtime.device import thread_count
 from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import check_file
@@ -39,7 +39,7 @@ from spackle.runtime.folders import results_folder
 from spackle.runtime.kernels import is_compiled
 from spackle.runtime.plugins import plugin_file
 from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
-from spackle.runtime.workers import parallel_map, torch_threads
+from spackle.runtime.workers import WorkerOptions, parallel_map, torch_threads
 from spackle.video.frames import video_problem
 from spackle.weights import installed_weights
 
@@ -51,8 +51,9 @@ class PredictOptions:
     scene: PipelineOptions
     photo: PhotoOptions
     overwrite: bool = False  # redo photos whose results exist
-    workers: int = 1  # processes that share the photos
+    workers: int | None = None  # processes that share the photos; None: one a GPU, or one
     threads: int | None = None  # of each worker; None: the cores, shared evenly
+    ray: str | None = None  # address of a Ray cluster, whose machines predict the photos
 
     def open_pipeline(self) -> Pipeline:
         """Open the pipeline for all photos; InputError for an option that no photo can use."""
@@ -200,8 +201,9 @@ def predict_photos(
     Raises:
         InputError: an option, or a single photo, cannot be used.
     """
-    worker_count = min(options.workers, len(photos))
-    threads = options.threads or max(1, thread_count() // worker_count)
+    workers = WorkerOptions.of_command(
+        options.workers, options.threads, options.scene.base.device, options.ray, len(photos)
+    )
     pipeline = options.open_pipeline()
     say_if_kernels_compile(pipeline, reporter)
     if is_single:
@@ -222,8 +224,10 @@ def predict_photos(
             verbose=reporter.verbose,
         )
         unfinished = predictor.unfinished(photos, reporter)
-        if worker_count == 1:
-            failure_count = _predict_in_this_process(predictor, unfinished, threads, reporter)
+        if workers.in_this_process:
+            failure_count = _predict_in_this_process(
+                predictor, unfinished, workers.threads, reporter
+            )
         else:
             # Each worker opens a predictor of its own, because networks do not travel between
             # processes.
@@ -231,10 +235,9 @@ def predict_photos(
                 functools.partial(Predictor.open, output, options, shared_digest, reporter.verbose),
                 list(unfinished),
                 photo_count=len(photos),
-                worker_count=worker_count,
-                threads=threads,
+                workers=workers,
+                output=output,
                 reporter=reporter,
-                uses_gpu=options.scene.base.device != "cpu",
             )
 
     if failure_count:
@@ -275,11 +278,9 @@ def _predict_by_workers(
     open_predictor: Callable[[], Predictor],
     unfinished: Sequence[NamedPhoto],
     photo_count: int,
-    worker_count: int,
-    threads: int,
+    workers: WorkerOptions,
+    output: Path,
     reporter: Reporter,
-    *,
-    uses_gpu: bool,
 ) -> int:
     """Predict photos by several processes, and print the messages about each finished photo.
 
@@ -287,10 +288,9 @@ def _predict_by_workers(
         open_predictor: opens a predictor in a process.
         unfinished: the photos that have no results yet.
         photo_count: the number of all photos, for the progress.
-        worker_count: the number of processes.
-        threads: of each process.
+        workers: the processes.
+        output: the folder of all results.
         reporter: gets messages and progress.
-        uses_gpu: whether each process uses one GPU.
 
     Returns:
         The number of photos that failed.
@@ -307,14 +307,7 @@ def _predict_by_workers(
     with (
         catch_stop_signals(single_process=True) as is_stopping,
         reporter.steps("photos", finished_before, photo_count) as report_step,
-        parallel_map(
-            open_predictor,
-            unfinished,
-            is_stopping,
-            count=worker_count,
-            threads=threads,
-            gpu=uses_gpu,
-        ) as results,
+        parallel_map(open_predictor, unfinished, is_stopping, workers, output) as results,
     ):
         for result in results:
             finished_count += 1
@@ -351,7 +344,16 @@ class Predictor:
 
     @staticmethod
     def open(output: Path, options: PredictOptions, shared_digest: str, verbose: bool) -> Predictor:
-        """Open the predictor of a worker process."""
+        """Open the predictor of a worker process.
+
+        InputError if its machine does not have the weights and files of the command's.
+        """
+        own_digest = options_digest(options)
+        if own_digest != shared_digest:
+            raise InputError(
+                f"{socket.gethostname()}: has other weights or files than the machine of the "
+                "command: a network folder for all of them is named by SPACKLE_WEIGHTS"
+            )
         return Predictor(
             output=output,
             options=options,
@@ -364,6 +366,9 @@ class Predictor:
     def make(self, photo: NamedPhoto) -> PhotoResult:
         """Predict a photo in a worker process, and keep the messages for the main process."""
         reporter = BufferedReporter(self.verbose)
+        # A worker that died may have finished the photo without saying so.
+        if self.is_done(photo):
+            return PhotoResult(photo.path.name, False, reporter.said)
         succeeded = self.predict(photo, reporter)
         return PhotoResult(photo.path.name, not succeeded, reporter.said)
 

@@ -1,4 +1,4 @@
-"""Divide jobs between processes of this machine."""
+"""Divide jobs between processes: of this machine, or of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from spackle.runtime.device import thread_count
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import end_with_parent
 
@@ -33,34 +36,88 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(previous_count)
 
 
+# A GPU keeps few threads busy, and a worker of a cluster should fit on any machine.
+THREADS_ON_RAY = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """The processes that share the jobs of a command."""
+
+    count: int | None  # of processes; None: one a GPU, or as many as a cluster has room for
+    threads: int  # torch's threads in each
+    gpu: bool  # whether each uses one GPU, where there is one
+    ray: str | None = None  # address of a Ray cluster; None: the processes run on this machine
+
+    @staticmethod
+    def of_command(
+        count: int | None, threads: int | None, device: str, ray: str | None, job_count: int
+    ) -> WorkerOptions:
+        """The processes for what a user has said, and for what he has not.
+
+        Args:
+            count: number of processes; by default one for each GPU of this machine, or one; on a
+                cluster as many as it has room for.
+            threads: of each process; by default this machine's cores, shared evenly.
+            device: "auto", "cpu", "cuda", or one GPU, such as "cuda:1".
+            ray: address of a Ray cluster, or None.
+            job_count: number of jobs; there are no more processes than jobs.
+        """
+        if ray is None and count is None:
+            # A GPU with a number is the only one that the user wants.
+            any_gpu = device in ("auto", "cuda")
+            count = max(torch.cuda.device_count(), 1) if any_gpu else 1
+        if count is not None:
+            count = max(1, min(count, job_count))
+        if threads is None:
+            threads = THREADS_ON_RAY if ray is not None else max(1, thread_count() // (count or 1))
+        return WorkerOptions(count=count, threads=threads, gpu=device != "cpu", ray=ray)
+
+    @property
+    def in_this_process(self) -> bool:
+        """Whether the calling process does all jobs."""
+        return self.ray is None and self.count == 1
+
+
+def this_process() -> WorkerOptions:
+    """The calling process alone, with the threads that it has."""
+    return WorkerOptions(count=1, threads=thread_count(), gpu=False)
+
+
 @contextlib.contextmanager
 def parallel_map(
     open_worker: Callable[[], Any],
     jobs: Sequence[Any],
     stop: Callable[[], bool],
-    count: int,
-    threads: int,
-    gpu: bool,
+    workers: WorkerOptions,
+    shared: Path,
 ) -> Iterator[Iterator[Any]]:
     """Do jobs in several processes; yields an iterator of the results, as they arrive.
 
     Args:
         open_worker: makes an object whose `make(job)` returns a job's result; called once in each
-            process. The function, jobs and results are pickled.
+            process. The function, jobs and results are pickled. On a Ray cluster a job may be done
+            twice if a machine dies, so `make` must see whether its result exists.
         jobs: arguments of `make`.
         stop: whether the user has asked the command to end; if so, a dead process is no error, but
             ends the results.
-        count: number of processes; with 1, jobs run in this process.
-        threads: torch's threads in each process.
-        gpu: whether each process uses one GPU.
+        workers: the processes. One process on this machine is the calling one.
+        shared: the folder into which `make` writes; the machines of a cluster must share it.
 
     Raises:
         InputError: no worker can be made, or a process has died.
     """
-    process_count = min(count, len(jobs))
+    if workers.ray is not None and jobs:
+        from spackle.runtime.ray_workers import ray_map  # only here, because Ray is optional
+
+        with ray_map(open_worker, jobs, stop, workers, shared) as results:
+            yield results
+        return
+
+    process_count = min(workers.count or 1, len(jobs))
     if process_count < 2:
         # One process more would only cost memory and time to start.
-        with torch_threads(threads):
+        with torch_threads(workers.threads):
             yield map(open_worker().make, jobs)
         return
 
@@ -68,13 +125,13 @@ def parallel_map(
     # Each process takes one number, which chooses its GPU; None means no GPU.
     gpu_numbers = spawn.SimpleQueue()
     for number in range(process_count):
-        gpu_numbers.put(number if gpu else None)
+        gpu_numbers.put(number if workers.gpu else None)
 
     pool = ProcessPoolExecutor(
         process_count,
         spawn,
         initializer=_start_process,
-        initargs=(threads, open_worker, gpu_numbers),
+        initargs=(workers.threads, open_worker, gpu_numbers),
     )
     try:
         yield _results_as_they_arrive(pool, jobs, JOBS_PER_PROCESS * process_count, stop)

@@ -12,8 +12,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
+import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import remove_half_written, write_atomic
 from spackle.runtime.folders import make_folder, results_folder
 from spackle.runtime.progress import Progress, Reporter, catch_stop_signals, pluralized
-from spackle.runtime.workers import parallel_map
+from spackle.runtime.workers import WorkerOptions, parallel_map
 
 PARTS_FOLDER = "parts"  # folder in the output for samples that are not in a shard yet
 
@@ -62,7 +63,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     """
     # Errors in options and weights come now, before any long work.
     options.check()
-    maker = SampleMaker(options)
+    maker = SampleMaker(options, output / PARTS_FOLDER)
     # Some inpainters have a licence that the user should know of.
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
@@ -78,38 +79,70 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
 
 @dataclasses.dataclass(frozen=True)
 class PhotoResult:
-    """The sample of a photo, or the reason why the photo has no sample."""
+    """That a photo's sample is written, or the reason why the photo has no sample."""
 
     index: int
-    sample: bytes | None = None  # the photo's part of a tar archive
     problem: str | None = None
 
 
 class SampleMaker:
     """Makes photos' samples: Gaussians, rendered views and completed targets."""
 
-    def __init__(self, options: DatasetOptions) -> None:
+    def __init__(self, options: DatasetOptions, parts: Path) -> None:
         """Open the base, which turns photos into Gaussians, and the inpainter, which paints holes.
 
-        Their networks are loaded with the first photo. InputError if opening fails.
+        Their networks are loaded with the first photo.
+
+        Args:
+            options: what to build.
+            parts: the folder for samples that wait for their shard.
+
+        Raises:
+            InputError: opening fails.
         """
         self.options = options
+        self.parts = parts
         self.base = open_base(options.base)
         self.renderer = get_renderer(options.base.device)
         self.inpainter = options.open_inpainter()
 
+    @staticmethod
+    def open(options: DatasetOptions, parts: Path, config: Mapping[str, Any]) -> SampleMaker:
+        """Open the maker of a worker process.
+
+        InputError if its machine would make other samples than the machine of the command, which
+        has this `config`.
+        """
+        maker = SampleMaker(options, parts)
+        own_config = dataset_configuration(options, (), maker.inpainter)
+        # Workers get one photo at a time, so they do not know them all.
+        own_config["photos"] = config["photos"]
+        changes = config_differences(config, own_config)
+        if changes:
+            raise InputError(
+                f"{socket.gethostname()}: differs from the machine of the command "
+                f"({'; '.join(changes)}): all need the same weights"
+            )
+        return maker
+
     def make(self, photo: PhotoFile) -> PhotoResult:
-        """Make a photo's sample; a problem of this photo alone is a result, too.
+        """Write a photo's sample; a problem of this photo alone is a result, too.
 
         BaseError if the network cannot be used for any photo.
         """
+        part = part_file(self.parts, photo)
+        # A worker that died may have written the sample without saying so.
+        if part.is_file():
+            return PhotoResult(photo.index)
         try:
-            return PhotoResult(photo.index, sample=self._make_sample(photo))
+            sample = self._make_sample(photo)
         except BaseError:
             # The next photo would fail in the same way, so the build ends.
             raise
         except InputError as error:
             return PhotoResult(photo.index, problem=str(error))
+        write_atomic(part, sample)
+        return PhotoResult(photo.index)
 
     def _make_sample(self, file: PhotoFile) -> bytes:
         """A photo's sample: its Gaussians, views and targets, as bytes of a tar archive.
@@ -156,6 +189,11 @@ class SampleMaker:
         )
 
 
+def part_file(parts: Path, photo: PhotoFile) -> Path:
+    """The file that holds a photo's sample until its shard is written."""
+    return parts / f"{photo.key}.tar"
+
+
 class DatasetBuild:
     """A build in progress: a dataset's photos, and the state of each."""
 
@@ -195,8 +233,9 @@ class DatasetBuild:
                 f"{output}: holds a dataset with other options ({'; '.join(changes)}): choose "
                 "another `output`"
             )
-        make_folder(output / PARTS_FOLDER)
-        remove_half_written(output, output / PARTS_FOLDER)
+        self.parts = output / PARTS_FOLDER
+        make_folder(self.parts)
+        remove_half_written(output, self.parts)
 
         # A shard counts if its file is there, whole. Its name is shard-NUMBER.tar.
         sizes = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}
@@ -208,10 +247,10 @@ class DatasetBuild:
 
         # Indices of photos whose sample is neither in a shard nor in a file of its own, a part.
         self.missing = set()
-        for index in range(len(photos)):
-            is_in_shard = self._shard_number(index) in self.shards
-            if not is_in_shard and not self._part(index).is_file():
-                self.missing.add(index)
+        for photo in photos:
+            is_in_shard = self._shard_number(photo.index) in self.shards
+            if not is_in_shard and not part_file(self.parts, photo).is_file():
+                self.missing.add(photo.index)
         self.problems: dict[int, str] = {}  # why photos have no sample, by index
 
     def run(self) -> str:
@@ -263,17 +302,19 @@ class DatasetBuild:
         """
         options = self.options
         ready_count = len(self.photos) - len(photos)
+        workers = WorkerOptions.of_command(
+            options.workers, options.threads, options.base.device, options.ray, len(photos)
+        )
         with parallel_map(
-            partial(SampleMaker, options),
+            partial(SampleMaker.open, options, self.parts, self.config),
             photos,
             stop_requested,
-            count=options.workers,
-            threads=options.threads,
-            gpu=options.base.device != "cpu",
+            workers,
+            self.output,
         ) as results:
             # Results come in any order, as soon as they are made.
             for done_count, result in enumerate(results, ready_count + 1):
-                self._store(result)
+                self._note(result)
                 self._write_shard_if_ready(self._shard_number(result.index))
                 progress(done_count, len(self.photos))
                 if stop_requested():
@@ -287,17 +328,11 @@ class DatasetBuild:
         """The number of shards; the last one may be smaller."""
         return math.ceil(len(self.photos) / self.options.shard_size)
 
-    def _part(self, index: int) -> Path:
-        """The file that holds a photo's sample until its shard is written."""
-        return self.output / PARTS_FOLDER / f"{self.photos[index].key}.tar"
-
-    def _store(self, result: PhotoResult) -> None:
-        """Keep a photo's sample in a file of its own until its shard is written.
+    def _note(self, result: PhotoResult) -> None:
+        """Note that a photo is done.
 
         If the photo has no sample, the reason is logged, and kept for the manifest.
         """
-        if result.sample is not None:
-            write_atomic(self._part(result.index), result.sample)
         self.missing.discard(result.index)
         if result.problem is not None:
             self.problems[result.index] = result.problem
@@ -323,7 +358,7 @@ class DatasetBuild:
             if index in self.problems:
                 problems.append(self._portable_problem(photo, self.problems[index]))
             else:
-                parts.append((photo.key, self._part(index)))
+                parts.append((photo.key, part_file(self.parts, photo)))
         name = f"shard-{number:06d}.tar"
         self.shards[number] = write_shard(parts, self.output / name, problems)
         self._save_manifest(complete=False)
@@ -344,10 +379,10 @@ class DatasetBuild:
         """
         if self._sample_count():
             self._save_manifest(complete=True)
-            shutil.rmtree(self.output / PARTS_FOLDER)
+            shutil.rmtree(self.parts)
             return
 
-        shutil.rmtree(self.output / PARTS_FOLDER)
+        shutil.rmtree(self.parts)
         # An empty dataset would only puzzle whoever finds it.
         shards = self.shards.values()
         for name in (MANIFEST_NAME, *(shard.file for shard in shards)):

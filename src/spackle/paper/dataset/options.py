@@ -44,8 +44,9 @@ class DatasetOptions:
     inpainter_weights: Path | None = None  # a file or folder, if the inpainter has a network
     # Long side in pixels of the images that the inpainter's network gets; None: its own default.
     inpainter_side: int | None = None
-    workers: int = 1  # processes
+    workers: int | None = None  # processes; None: one a GPU, or one
     threads: int = 2  # threads per process
+    ray: str | None = None  # address of a Ray cluster, whose machines make the samples
     shard_size: int = 50  # photos per shard, that is, per tar file
 
     def open_inpainter(self) -> Inpainter | None:

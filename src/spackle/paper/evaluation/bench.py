@@ -27,6 +27,7 @@ from spackle.paper.evaluation.evaluation import Evaluation, open_evaluation
 from spackle.paper.evaluation.folder import (
     MEASUREMENTS_FILE,
     ImageResults,
+    ImageWorker,
     RunPlan,
     measure_images,
     write_measurements,
@@ -48,6 +49,7 @@ from spackle.residual import ResidualNet
 from spackle.runtime.device import hardware_facts, package_versions
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
+from spackle.runtime.workers import this_process
 from spackle.scene_fill import FillContext
 from spackle.scene_fill.context import PhotoRendering
 
@@ -115,8 +117,8 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> Run | None
         about={},  # the configuration has machine and versions
     )
 
-    def measure(index: int, case: Case) -> ImageResults:
-        """The times of one image; a benchmark has no pictures."""
+    def measure(index: int, case: Case, reporter: Reporter) -> ImageResults:
+        """The times of one image; a benchmark has no pictures, and no remarks to report."""
         measurements = time_case(
             case, evaluation, runs=options.runs, base_runs=options.timed_runs_of_base
         )
@@ -124,7 +126,9 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> Run | None
 
     files = (MEASUREMENTS_FILE, MARKDOWN_FILE, LATEX_FILE)
     with results_folder(output, files, locked=True):
-        run = measure_images(plan, measure, reporter)
+        # By this process alone: others beside it would make everything slower.
+        worker = ImageWorker(plan, measure, reporter.verbose)
+        run = measure_images(plan, lambda: worker, reporter, this_process())
         if run is None:
             return None
         write_tables(

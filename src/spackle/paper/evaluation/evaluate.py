@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import socket
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from spackle.paper.evaluation.evaluation import Evaluation, open_evaluation
 from spackle.paper.evaluation.folder import (
     MEASUREMENTS_FILE,
     ImageResults,
+    ImageWorker,
     RunPlan,
     load_run,
     measure_images,
@@ -54,11 +56,13 @@ from spackle.paper.evaluation.table import NOT_RUN, to_plain_lines
 from spackle.paper.evaluation.tables import LATEX_FILE, MARKDOWN_FILE, make_tables, write_tables
 from spackle.residual import hole_mask
 from spackle.runtime.device import hardware_facts, package_versions
+from spackle.runtime.digests import config_differences
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import results_folder
 from spackle.runtime.plugins import is_plugin, load_function
 from spackle.runtime.progress import Reporter, pluralized
+from spackle.runtime.workers import WorkerOptions
 from spackle.scene_fill import FillContext
 
 
@@ -101,13 +105,26 @@ def evaluate(
             "metrics": evaluation.metric_states,
         },
     )
+    workers = WorkerOptions.of_command(
+        options.workers, options.threads, options.base.device, options.ray, len(plan.cases)
+    )
+
+    def open_worker() -> ImageWorker:
+        """The worker of this process, whose networks are open already."""
+        return _worker_of(evaluation, plan, reporter.verbose)
+
+    # Networks do not travel between processes, so each opens its own.
+    open_elsewhere = functools.partial(
+        _open_worker, options, earlier_metrics, plan, reporter.verbose
+    )
     files = [MEASUREMENTS_FILE, WORST_SHEET_FILE, BEST_SHEET_FILE, MARKDOWN_FILE, LATEX_FILE]
     if html:
         files.append(REPORT_FILE)
 
     with results_folder(output, files, locked=True):
-        measure = functools.partial(_measure_and_save_pictures, evaluation, output, reporter)
-        run = measure_images(plan, measure, reporter)
+        run = measure_images(
+            plan, open_worker if workers.in_this_process else open_elsewhere, reporter, workers
+        )
         if run is None:
             return None
 
@@ -161,17 +178,50 @@ def _report_results(run: Run, output: Path, reporter: Reporter) -> None:
     )
 
 
+def _open_worker(
+    options: EvaluateOptions, earlier_metrics: Sequence[str], plan: RunPlan, verbose: bool
+) -> ImageWorker:
+    """Open the evaluation in a worker process.
+
+    Args:
+        options: what to evaluate.
+        earlier_metrics: metrics that an earlier run has measured.
+        plan: the images, and what determines the results on the machine of the command.
+        verbose: whether to say how long each image took.
+
+    Raises:
+        InputError: this machine would give other results than that of the command.
+    """
+    evaluation = open_evaluation(options, earlier_metrics)
+    changes = config_differences(
+        {**plan.config, "metrics": plan.about["metrics"]},
+        {**evaluation.config, "metrics": evaluation.metric_states},
+    )
+    if changes:
+        raise InputError(
+            f"{socket.gethostname()}: differs from the machine of the command "
+            f"({'; '.join(changes)}): all need the same packages, weights and kind of device"
+        )
+    return _worker_of(evaluation, plan, verbose)
+
+
+def _worker_of(evaluation: Evaluation, plan: RunPlan, verbose: bool) -> ImageWorker:
+    """What measures images with an evaluation's networks, and saves pictures of each."""
+    measure = functools.partial(_measure_and_save_pictures, evaluation, plan.output)
+    return ImageWorker(plan, measure, verbose)
+
+
 def _measure_and_save_pictures(
-    evaluation: Evaluation, output: Path, reporter: Reporter, index: int, case: Case
+    evaluation: Evaluation, output: Path, index: int, case: Case, reporter: Reporter
 ) -> ImageResults:
     """Measure an image, and save its pictures in images/.
 
     Args:
         evaluation: networks and metrics.
         output: the folder of the results.
-        reporter: gets the remarks on the image.
         index: the image's place in the dataset.
         case: the image.
+        reporter: gets the remarks on the image.
 
     Raises:
         InputError: a file is missing or cannot be used.

@@ -43,7 +43,8 @@ from spackle.runtime.files import (
     write_json,
 )
 from spackle.runtime.folders import make_folder
-from spackle.runtime.progress import Reporter, catch_stop_signals
+from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
+from spackle.runtime.workers import WorkerOptions, parallel_map
 
 CONFIG_FILE = "config.json"
 MEASUREMENTS_FILE = "rows.jsonl"
@@ -62,8 +63,8 @@ class ImageResults(NamedTuple):
     files: list[Path]  # pictures that were written into images/
 
 
-# Measures the case with this index.
-MeasureImage = Callable[[int, Case], ImageResults]
+# Measures the case with this index, and says what is remarkable.
+MeasureImage = Callable[[int, Case, Reporter], ImageResults]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -136,7 +137,74 @@ def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
     return output / IMAGES_FOLDER / f"{index:05d}-{short_name}{suffix}"
 
 
-def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> Run | None:
+@dataclasses.dataclass(frozen=True)
+class ImageJob:
+    """An image to measure."""
+
+    index: int  # the image's place in the dataset
+    inputs_digest: str  # tells a later run whether photos or metrics have changed
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageDone:
+    """What a worker says about an image."""
+
+    index: int
+    measurements: list[Measurement]
+    messages: Sequence[str | Mapping[str, object]]  # for the user
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageWorker:
+    """Measures one image after the other, and saves their numbers in images/."""
+
+    plan: RunPlan
+    measure: MeasureImage
+    verbose: bool  # whether to say how long each image took
+
+    def make(self, job: ImageJob) -> ImageDone:
+        """Measure an image, and save its numbers so that a later run need not measure it.
+
+        If a file of the image cannot be used, the result is a measurement with this problem, which
+        is not saved.
+
+        Raises:
+            BaseError: every image would fail, for instance because memory is too small.
+        """
+        case = self.plan.cases[job.index]
+        reporter = BufferedReporter(self.verbose)
+        results_path = image_file(self.plan.output, job.index, case.name, ".json")
+        # A worker that died may have measured the image without saying so.
+        measurements = _load_image_results(results_path, job.inputs_digest)
+        if measurements is not None:
+            return ImageDone(job.index, measurements, reporter.said)
+
+        start = time.perf_counter()
+        try:
+            results = self.measure(job.index, case, reporter)
+        except BaseError:  # an InputError that concerns all images, so it ends the run
+            raise
+        except InputError as error:
+            problem = _problem_of(case, error, self.plan)
+            reporter.log(f"passed over: {problem.value}")
+            return ImageDone(job.index, [problem], reporter.said)
+
+        content = {
+            "inputs": job.inputs_digest,
+            "files": file_records(results_path.parent, results.files),
+            "rows": results.measurements,
+        }
+        write_atomic(results_path, (json.dumps(content, allow_nan=False) + "\n").encode())
+        reporter.detail(f"  {case.name}: {time.perf_counter() - start:.1f} s")
+        return ImageDone(job.index, results.measurements, reporter.said)
+
+
+def measure_images(
+    plan: RunPlan,
+    open_worker: Callable[[], ImageWorker],
+    reporter: Reporter,
+    workers: WorkerOptions,
+) -> Run | None:
     """Measure the images that earlier runs in the folder have not finished, and return all results.
 
     A finished image is measured again if its photos or the versions of the metrics have changed.
@@ -145,8 +213,9 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
 
     Args:
         plan: the images, the options and the folder.
-        measure: measures one image.
+        open_worker: opens what measures images, in each process that does so.
         reporter: gets progress, and a line for each image that cannot be used.
+        workers: the processes that share the images.
 
     Returns:
         The results of all images; None after Ctrl-C.
@@ -156,39 +225,35 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
         InputError: no image could be measured, or the folder holds results of other options.
     """
     _open_folder(plan)
-    # Cached, because many cases may share a second photo.
-    cached_photo_digest = functools.cache(photo_digest)
-    all_measurements: list[Measurement] = []
-    has_measured = False
+    measured, jobs = _finished_and_unfinished(plan)
+    if jobs:
+        # This file says that the results are complete, but from now on they are not.
+        (plan.output / MEASUREMENTS_FILE).unlink(missing_ok=True)
+        if measured:
+            finished = f"{len(measured)} of {len(plan.cases)} images are done"
+            reporter.log(f"{plan.output}: going on, {finished}")
 
     with (
         reporter.stage("images") as progress,
         # In a single process, unlike under torchrun, a second Ctrl-C can end the run at once.
         catch_stop_signals(single_process=True) as is_stopped,
+        parallel_map(open_worker, jobs, is_stopped, workers, plan.output) as results,
     ):
-        for index, case in enumerate(plan.cases):
+        for image in results:
+            measured[image.index] = image.measurements
+            for message in image.messages:
+                reporter.log(str(message))
+            progress(len(measured), len(plan.cases))
             if is_stopped():
-                reporter.log("stopped; the same command resumes from here")
-                return None
+                break
+    if len(measured) < len(plan.cases):
+        reporter.log("stopped; the same command resumes from here")
+        return None
 
-            results_path = image_file(plan.output, index, case.name, ".json")
-            inputs_digest = _inputs_digest(case, plan, cached_photo_digest)
-            measurements = _load_image_results(results_path, inputs_digest)
-
-            if measurements is None:
-                # Before the first image to measure, say how far an earlier run came.
-                if index > 0 and not has_measured:
-                    finished = f"{index} of {len(plan.cases)} images are done"
-                    reporter.log(f"{plan.output}: going on, {finished}")
-                has_measured = True
-
-                # This file says that the results are complete, but from now on they are not.
-                (plan.output / MEASUREMENTS_FILE).unlink(missing_ok=True)
-                measurements = _measure_image(index, case, measure, plan, inputs_digest, reporter)
-
-            all_measurements += measurements
-            progress(index + 1, len(plan.cases))
-
+    # In the order of the dataset, however many processes there were.
+    all_measurements: list[Measurement] = []
+    for index in range(len(plan.cases)):
+        all_measurements += measured[index]
     run = Run(plan.config, all_measurements, plan.about)
     if not run.measured_images:
         raise InputError(
@@ -198,58 +263,31 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
     return run
 
 
+def _finished_and_unfinished(
+    plan: RunPlan,
+) -> tuple[dict[int, list[Measurement]], list[ImageJob]]:
+    """The numbers of images that earlier runs have measured, by index, and the other images."""
+    # Cached, because many cases may share a second photo.
+    cached_photo_digest = functools.cache(photo_digest)
+    measured: dict[int, list[Measurement]] = {}
+    jobs = []
+    for index, case in enumerate(plan.cases):
+        results_path = image_file(plan.output, index, case.name, ".json")
+        inputs_digest = _inputs_digest(case, plan, cached_photo_digest)
+        measurements = _load_image_results(results_path, inputs_digest)
+        if measurements is None:
+            jobs.append(ImageJob(index, inputs_digest))
+        else:
+            measured[index] = measurements
+    return measured, jobs
+
+
 def _inputs_digest(case: Case, plan: RunPlan, digest_of_photo: Callable[[Path], str]) -> str:
     """A digest of what may change between runs: the case's photos, and how metrics are measured."""
     # A metric that can be measured now may not have been in an earlier run.
     photos = [case.photo, *(view.photo for view in case.second_views)]
     photo_digests = [digest_of_photo(photo) for photo in photos]
     return json_digest([photo_digests, plan.about.get("metrics")])
-
-
-def _measure_image(
-    index: int,
-    case: Case,
-    measure: MeasureImage,
-    plan: RunPlan,
-    inputs_digest: str,
-    reporter: Reporter,
-) -> list[Measurement]:
-    """Measure one image, and save its numbers in images/ so that a later run need not measure it.
-
-    Args:
-        index: the image's place in the dataset.
-        case: the image.
-        measure: measures the image.
-        plan: has the folder of the results.
-        inputs_digest: tells a later run whether photos or metrics have changed.
-        reporter: gets the seconds that this took, or the problem.
-
-    Returns:
-        The numbers; if a file of the image cannot be used, a measurement with this problem, which
-        is not saved.
-
-    Raises:
-        BaseError: every image would fail, for instance because memory is too small.
-    """
-    start = time.perf_counter()
-    try:
-        results = measure(index, case)
-    except BaseError:  # an InputError that concerns all images, so it ends the run
-        raise
-    except InputError as error:
-        problem = _problem_of(case, error, plan)
-        reporter.log(f"passed over: {problem.value}")
-        return [problem]
-
-    results_path = image_file(plan.output, index, case.name, ".json")
-    content = {
-        "inputs": inputs_digest,
-        "files": file_records(results_path.parent, results.files),
-        "rows": results.measurements,
-    }
-    write_atomic(results_path, (json.dumps(content, allow_nan=False) + "\n").encode())
-    reporter.detail(f"  {case.name}: {time.perf_counter() - start:.1f} s")
-    return results.measurements
 
 
 def _problem_of(case: Case, error: InputError, plan: RunPlan) -> Measurement:

@@ -73,6 +73,9 @@ class EvaluateOptions:
     side: int | None = None
     limit: int | None = None  # the number of images, spread over the dataset; None: all
     download_metrics: bool = False  # whether pyiqa may fetch the weights of metrics
+    workers: int | None = None  # processes that share the images; None: one a GPU, or one
+    threads: int | None = None  # of each process; None: the cores, shared evenly
+    ray: str | None = None  # address of a Ray cluster, whose machines measure the images
 
     @property
     def fill(self) -> FillOptions:
