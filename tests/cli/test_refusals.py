@@ -60,6 +60,7 @@ PREDICT = [
     ("--depth-out a/depth.npy", "--depth-out a/depth.npy"),
     ("--base sharp9", "--base"),
     ("--device cuda", "--device"),
+    ("--device cuda:x", "--device cuda:x: give auto, cpu, cuda, or one GPU such as cuda:1"),
     ("-c weights.pt", "-c"),
     ("--cameras sizes.json", "--no-render"),
     *(

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from spackle.runtime.worker_options import WorkerOptions
 from spackle.runtime.workers import parallel_map
 
 chosen: list[int] = []
@@ -32,7 +33,22 @@ class Worker:
 def test_each_process_uses_a_gpu_of_its_own(
     tmp_path: Path, gpu: bool, expected: set[tuple[int, ...]]
 ) -> None:
-    with parallel_map(
-        Worker, [tmp_path] * 4, lambda: False, count=2, threads=1, gpu=gpu
-    ) as results:
+    workers = WorkerOptions(count=2, threads=1, gpu=gpu)
+    with parallel_map(Worker, [tmp_path] * 4, lambda: False, workers, tmp_path) as results:
         assert set(results) == expected
+
+
+@pytest.mark.parametrize(
+    ("count", "device", "ray", "expected"),
+    [
+        (None, "auto", None, 2),  # one for each of two GPUs
+        (None, "cpu", None, 1),
+        (5, "cpu", None, 3),  # no more than jobs
+        (None, "auto", "local", None),  # as many as the cluster has room for
+    ],
+)
+def test_a_user_who_says_nothing_gets_a_process_for_each_gpu(
+    monkeypatch: pytest.MonkeyPatch, count: int | None, device: str, ray: str | None, expected: int
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert WorkerOptions.of_command(count, None, device, ray, job_count=3).count == expected

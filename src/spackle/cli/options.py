@@ -40,7 +40,7 @@ DEVICE_NAME = re.compile(r"auto|cpu|cuda(:(?P<number>[0-9]{1,3}))?")
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]
 
 
-def _device(name: str) -> str:
+def use_gpu_alone(name: str) -> str:
     """The device without the number of a GPU, which becomes the only one that torch sees.
 
     So all that runs in this process, and in processes that it starts, uses this GPU. InputError for
@@ -63,7 +63,7 @@ DeviceOption = Annotated[
     str,
     typer.Option(
         metavar="auto|cpu|cuda|cuda:N",
-        callback=_device,
+        callback=use_gpu_alone,
         help="Device of networks and renderer; cuda:1: the second GPU.",
     ),
 ]

@@ -39,7 +39,8 @@ from spackle.runtime.folders import results_folder
 from spackle.runtime.kernels import is_compiled
 from spackle.runtime.plugins import plugin_file
 from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
-from spackle.runtime.workers import WorkerOptions, parallel_map, torch_threads
+from spackle.runtime.worker_options import WorkerOptions
+from spackle.runtime.workers import parallel_map, torch_threads
 from spackle.video.frames import video_problem
 from spackle.weights import installed_weights
 
@@ -224,7 +225,8 @@ def predict_photos(
             verbose=reporter.verbose,
         )
         unfinished = predictor.unfinished(photos, reporter)
-        if workers.in_this_process:
+        # A single photo is not worth a worker's start.
+        if workers.in_this_process or is_single:
             failure_count = _predict_in_this_process(
                 predictor, unfinished, workers.threads, reporter
             )

@@ -20,12 +20,13 @@ import torch
 
 import spackle
 from spackle.runtime.errors import InputError, reason_in_a_line
-from spackle.runtime.workers import WorkerOptions
+from spackle.runtime.worker_options import WorkerOptions
 
 # A job that has ended its process so often will do so again, for instance because memory runs out.
 RETRIES = 3
 # A worker always has its next job at hand; more jobs would have to be done again if it dies.
 JOBS_PER_WORKER = 2
+MARK_NAME = ".ray"  # a file in the folder of the results while a cluster works on them
 POLL_SECONDS = 0.5  # between two looks whether the user wants the command to end
 
 
@@ -34,7 +35,8 @@ class Surroundings(NamedTuple):
 
     version: str  # of Spackle
     current_folder: str  # relative paths start here
-    mark: Path  # a file in the folder of the results; who sees it sees the same folder
+    mark: Path  # a file in the folder of the results
+    mark_text: bytes  # its content; who reads it sees the same folder
     environment: dict[str, str]  # variables that say where weights lie
 
 
@@ -65,10 +67,12 @@ def ray_map(
             not see the folder or runs another version, or a job has ended its worker several times.
     """
     ray = _connect(str(options.ray))
-    mark = shared.absolute() / f".ray-{uuid.uuid4().hex}"
+    # Of one name, so that the next run removes that of a killed one.
+    mark = shared.absolute() / MARK_NAME
+    mark_text = uuid.uuid4().hex.encode()
     try:
         room, gpu_count = _room(ray, options)
-        mark.touch()
+        mark.write_bytes(mark_text)
         worker_class = ray.remote(
             num_cpus=options.threads,
             num_gpus=gpu_count,
@@ -79,6 +83,7 @@ def ray_map(
             version=spackle.__version__,
             current_folder=os.getcwd(),
             mark=mark,
+            mark_text=mark_text,
             environment={
                 name: value for name, value in os.environ.items() if name.startswith("SPACKLE_")
             },
@@ -224,7 +229,10 @@ class RayWorker:
                 f"{machine} runs Spackle {spackle.__version__}, and the command "
                 f"{expected.version}: install one version everywhere"
             )
-        if not expected.mark.exists():
+        mark_text = b""
+        with contextlib.suppress(OSError):
+            mark_text = expected.mark.read_bytes()
+        if mark_text != expected.mark_text:
             raise InputError(
                 f"{machine} does not see {expected.mark.parent}: all machines need the same "
                 "`output` by the same path, such as a network folder"

@@ -11,15 +11,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from spackle.runtime.device import thread_count
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import end_with_parent
+from spackle.runtime.worker_options import WorkerOptions
 
 # A process always has its next job at hand; more jobs would keep more results in memory.
 JOBS_PER_PROCESS = 2
@@ -34,54 +33,6 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(previous_count)
-
-
-# A GPU keeps few threads busy, and a worker of a cluster should fit on any machine.
-THREADS_ON_RAY = 2
-
-
-@dataclass(frozen=True, kw_only=True)
-class WorkerOptions:
-    """The processes that share the jobs of a command."""
-
-    count: int | None  # of processes; None: one a GPU, or as many as a cluster has room for
-    threads: int  # torch's threads in each
-    gpu: bool  # whether each uses one GPU, where there is one
-    ray: str | None = None  # address of a Ray cluster; None: the processes run on this machine
-
-    @staticmethod
-    def of_command(
-        count: int | None, threads: int | None, device: str, ray: str | None, job_count: int
-    ) -> WorkerOptions:
-        """The processes for what a user has said, and for what he has not.
-
-        Args:
-            count: number of processes; by default one for each GPU of this machine, or one; on a
-                cluster as many as it has room for.
-            threads: of each process; by default this machine's cores, shared evenly.
-            device: "auto", "cpu", "cuda", or one GPU, such as "cuda:1".
-            ray: address of a Ray cluster, or None.
-            job_count: number of jobs; there are no more processes than jobs.
-        """
-        if ray is None and count is None:
-            # A GPU with a number is the only one that the user wants.
-            any_gpu = device in ("auto", "cuda")
-            count = max(torch.cuda.device_count(), 1) if any_gpu else 1
-        if count is not None:
-            count = max(1, min(count, job_count))
-        if threads is None:
-            threads = THREADS_ON_RAY if ray is not None else max(1, thread_count() // (count or 1))
-        return WorkerOptions(count=count, threads=threads, gpu=device != "cpu", ray=ray)
-
-    @property
-    def in_this_process(self) -> bool:
-        """Whether the calling process does all jobs."""
-        return self.ray is None and self.count == 1
-
-
-def this_process() -> WorkerOptions:
-    """The calling process alone, with the threads that it has."""
-    return WorkerOptions(count=1, threads=thread_count(), gpu=False)
 
 
 @contextlib.contextmanager

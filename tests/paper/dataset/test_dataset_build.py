@@ -95,7 +95,7 @@ def test_workers_end_with_a_killed_build(
 def dying(*arguments):
     print(*(child.pid for child in multiprocessing.active_children()), flush=True)
     die()
-build.DatasetBuild._store = dying"""
+build.DatasetBuild._note = dying"""
     process = dying_build(tmp_path / "script.py", patch, place, tmp_path / "out", "--workers", 2)
     assert process.wait() == -signal.SIGKILL
     workers = [int(pid) for pid in capfd.readouterr().out.split()]

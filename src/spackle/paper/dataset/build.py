@@ -41,7 +41,8 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import remove_half_written, write_atomic
 from spackle.runtime.folders import make_folder, results_folder
 from spackle.runtime.progress import Progress, Reporter, catch_stop_signals, pluralized
-from spackle.runtime.workers import WorkerOptions, parallel_map
+from spackle.runtime.worker_options import WorkerOptions
+from spackle.runtime.workers import parallel_map
 
 PARTS_FOLDER = "parts"  # folder in the output for samples that are not in a shard yet
 

@@ -49,7 +49,7 @@ from spackle.residual import ResidualNet
 from spackle.runtime.device import hardware_facts, package_versions
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
-from spackle.runtime.workers import this_process
+from spackle.runtime.worker_options import this_process
 from spackle.scene_fill import FillContext
 from spackle.scene_fill.context import PhotoRendering
 

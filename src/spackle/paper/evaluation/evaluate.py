@@ -62,7 +62,7 @@ from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import results_folder
 from spackle.runtime.plugins import is_plugin, load_function
 from spackle.runtime.progress import Reporter, pluralized
-from spackle.runtime.workers import WorkerOptions
+from spackle.runtime.worker_options import WorkerOptions
 from spackle.scene_fill import FillContext
 
 

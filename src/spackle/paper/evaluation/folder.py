@@ -44,7 +44,8 @@ from spackle.runtime.files import (
 )
 from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
-from spackle.runtime.workers import WorkerOptions, parallel_map
+from spackle.runtime.worker_options import WorkerOptions
+from spackle.runtime.workers import parallel_map
 
 CONFIG_FILE = "config.json"
 MEASUREMENTS_FILE = "rows.jsonl"
