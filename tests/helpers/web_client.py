@@ -23,6 +23,7 @@ from helpers.photos import picture
 from spackle.web.app import create_app, make_server
 from spackle.web.guard import Access
 from spackle.web.jobs import Jobs, RetentionLimits
+from spackle.web.public_address import LOCAL_ONLY, PublicAddress
 
 MAX_BYTES = 100_000  # of an upload
 PATIENCE_S = 300.0  # bound for events that take no time unless the machine is busy
@@ -117,6 +118,7 @@ def served(
     work: Any = web_work.work,
     max_bytes: int = MAX_BYTES,
     keep: RetentionLimits = RetentionLimits(),  # noqa: B008
+    public: PublicAddress = LOCAL_ONLY,
 ) -> Iterator[Served]:
     with socket.socket() as listener:
         listener.bind((host, 0))
@@ -126,7 +128,7 @@ def served(
             folder,
             work,
             keep=keep,
-            access=Access.for_listener(host, address, token),
+            access=Access.for_listener(host, address, token, public),
             max_bytes=max_bytes,
         )
         server = make_server(app)

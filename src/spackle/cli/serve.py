@@ -59,6 +59,30 @@ def serve(
             min=1, metavar="N", help="Number of photos that may wait; more photos are refused."
         ),
     ] = 32,
+    allowed_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="A host name by which clients call the server, such as photos.example.com; "
+            "may be repeated.",
+        ),
+    ] = None,
+    public_url: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Address of the page behind a reverse proxy, such as https://example.com/photos; "
+            "its host name is allowed.",
+        ),
+    ] = None,
+    proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Address or network of a reverse proxy whose X-Forwarded-Host is believed; "
+            "may be repeated.",
+        ),
+    ] = None,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")
     ] = "auto",
@@ -76,6 +100,7 @@ def serve(
     from spackle.cli.messages import CommandReporter
     from spackle.web.jobs import RetentionLimits
     from spackle.web.local_server import ServerAddress, serve_programs
+    from spackle.web.public_address import PublicAddress
     from spackle.web.work import SceneWork
 
     # Without a token, or with an empty one, the server makes its own and prints it: it never runs
@@ -86,7 +111,16 @@ def serve(
         SceneWork(base_settings, verbose=verbose),
         workers,
         RetentionLimits(keep * SECONDS_A_DAY, quota * BYTES_A_GB, waiting),
-        ServerAddress(host=host, port=port, token=token or secrets.token_urlsafe(TOKEN_BYTES)),
+        ServerAddress(
+            host=host,
+            port=port,
+            token=token or secrets.token_urlsafe(TOKEN_BYTES),
+            public=PublicAddress(
+                allowed_hosts=tuple(allowed_host or ()),
+                url=public_url,
+                proxies=tuple(proxy or ()),
+            ),
+        ),
         CommandReporter(verbose, as_json=as_json),
     )
     # The server returns only after Ctrl-C.

@@ -106,7 +106,8 @@ def create_app(
     # `SceneWork` has a method that lists the bases, the networks for a photo's geometry. Another
     # function as `work` has none; clients can then only choose AUTO.
     list_bases = getattr(work, "bases", lambda: [AUTO])
-    handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes)
+    public_path = "" if access is None else access.public.path
+    handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes, public_path)
     add_scene_routes(app, handlers)
     add_page_routes(app, handlers)
     return app
@@ -168,6 +169,7 @@ class SceneHandlers:
         list_bases: Callable[[], list[str]],
         takes_photos: bool,
         max_bytes: int,
+        public_path: str,
     ) -> None:
         """Prepare to answer requests.
 
@@ -177,11 +179,13 @@ class SceneHandlers:
                 client may choose.
             takes_photos: whether a client may send photos; otherwise the page only shows scenes.
             max_bytes: size limit of an upload.
+            public_path: the part of an address's path that a proxy takes away, such as "/photos".
         """
         self.jobs = jobs
         self.list_bases = list_bases
         self.takes_photos = takes_photos
         self.max_bytes = max_bytes
+        self.public_path = public_path
         # One photo is decoded at a time: decoding a large one takes a gigabyte of memory.
         self.decoding = asyncio.Lock()
 
@@ -230,8 +234,10 @@ class SceneHandlers:
             finally:
                 await form.close()
 
-        # The root path holds the token, or the place where another app has mounted this one.
-        response.headers["Location"] = f"{request.scope['root_path']}{SCENES_PATH}/{job.id}"
+        # The root path holds the token, or the place where another app has mounted this one. A
+        # proxy may have taken another part of the path away.
+        path = f"{self.public_path}{request.scope['root_path']}{SCENES_PATH}/{job.id}"
+        response.headers["Location"] = path
         return job
 
     async def get_state(self, id: str) -> SceneState:

@@ -12,7 +12,7 @@ import ipaddress
 import logging
 import re
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -22,6 +22,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from spackle.runtime.errors import printable_line
+from spackle.web.public_address import LOCAL_ONLY, PublicAddress
 
 LOG = logging.getLogger("spackle.web")
 # A Host header: a name or a numeric address, which is group 1, and perhaps a port.
@@ -55,20 +56,24 @@ class Access(NamedTuple):
     token: str | None
     names: frozenset[str] = frozenset({"localhost"})  # accepted host names
     local: bool = True  # only this machine can connect
+    public: PublicAddress = LOCAL_ONLY  # names and proxies outside of this machine
 
     @staticmethod
-    def for_listener(host: str, address: str, token: str | None) -> Access:
+    def for_listener(
+        host: str, address: str, token: str | None, public: PublicAddress = LOCAL_ONLY
+    ) -> Access:
         """The rules for a server that listens at `host`, whose numeric address is `address`.
 
         If other machines can connect, the names by which they call this machine are accepted, too.
+        Names of `public` are accepted in any case.
         """
         if is_loopback(address):
-            return Access(token)
+            return Access(token, public=public)
         machine = socket.gethostname().lower()
         short_name = machine.partition(".")[0]
         # NAME.local is the name that machines of a home network use without a name server.
         names = frozenset({"localhost", machine, short_name, f"{short_name}.local", host.lower()})
-        return Access(token, names, local=False)
+        return Access(token, names, local=False, public=public)
 
     def authorize(self, scope: Scope, headers: Headers) -> Scope:
         """Check a request, and strip the token from its path.
@@ -84,7 +89,8 @@ class Access(NamedTuple):
             HTTPException: 403 for the name of another host or the page of another site, 401 without
                 the token.
         """
-        check_same_site(headers, self._is_own_name)
+        hosts = self.public.asked_hosts(headers, scope.get("client"))
+        check_same_site(headers, hosts, self._is_own_name, self.public.origin)
 
         # An address of the page holds the token: /TOKEN/viewer.css.
         root = scope["root_path"]  # where another app has mounted this one
@@ -119,7 +125,7 @@ class Access(NamedTuple):
             # any address.
             return is_loopback(name.strip("[]")) or not self.local
         except ValueError:  # no numeric address
-            return name.rstrip(".") in self.names
+            return name.rstrip(".") in self.names | self.public.names
 
     def _is_token(self, word: str) -> bool:
         """Whether a word is the token.
@@ -135,22 +141,32 @@ def is_loopback(address: str) -> bool:
     return ipaddress.ip_address(without_zone).is_loopback
 
 
-def check_same_site(headers: Headers, is_own_name: Callable[[str], bool]) -> None:
+def check_same_site(
+    headers: Headers,
+    hosts: Sequence[str],
+    is_own_name: Callable[[str], bool],
+    public_origin: str | None,
+) -> None:
     """Refuse a request that a page of another site has made a browser send; HTTPException 403.
 
     Args:
         headers: of the request. Browsers set Host, Origin and Sec-Fetch-Site; no page can change
             them. Programs need not send Origin and Sec-Fetch-Site.
+        hosts: the values of Host as the browser sent them.
         is_own_name: whether a host name in lower case belongs to this server.
+        public_origin: Origin of the server's own page behind a proxy, or None.
     """
-    hosts = headers.getlist("host")
     match = HOST_PATTERN.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
     if match is None or not is_own_name(match[1].lower()):
-        raise HTTPException(403, "this server does not have that Host name")
+        raise HTTPException(
+            403, "this server does not have that Host name: whoever runs it can allow the name"
+        )
 
     # Through a tunnel, a browser may see this server by https.
     own_host = hosts[0].strip().lower()
     own_origins = {f"http://{own_host}", f"https://{own_host}"}
+    if public_origin is not None:
+        own_origins.add(public_origin)
     origins = {origin.strip().lower() for origin in headers.getlist("origin")}
     sites = {site.strip().lower() for site in headers.getlist("sec-fetch-site")}
     if not origins <= own_origins or not sites <= OWN_SITES:

@@ -30,6 +30,7 @@ from spackle.views import PathOptions
 from spackle.web.app import create_app, make_server
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, RetentionLimits
+from spackle.web.public_address import LOCAL_ONLY, PublicAddress
 from spackle.web.work import PREVIEW, SceneWork, check_photo
 
 # Hosts at which a server accepts connections from everywhere, and the address on this machine.
@@ -47,12 +48,21 @@ class ServerAddress:
     host: str
     port: int  # 0: any free port
     token: str | None  # the secret that a client must know; None: everybody on this machine may
+    public: PublicAddress = LOCAL_ONLY  # names outside of this machine, and proxies
 
     def url_at(self, host: str, port: int) -> str:
         """The page's address, with the token, at a host and the port that was found."""
         bracketed_host = f"[{host}]" if ":" in host else host  # IPv6
         path = f"{self.token}/" if self.token else ""
         return f"http://{bracketed_host}:{port}/{path}"
+
+    @property
+    def public_url(self) -> str | None:
+        """The page's address behind a proxy, with the token, if the user has given one."""
+        if self.public.url is None:
+            return None
+        path = f"{self.token}/" if self.token else ""
+        return f"{self.public.url.rstrip('/')}/{path}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -239,7 +249,7 @@ def run_server(
         log_jobs_to(reporter),
     ):
         bound_host, port = listener.getsockname()[:2]
-        access = Access.for_listener(address.host, bound_host, address.token)
+        access = Access.for_listener(address.host, bound_host, address.token, address.public)
         if not access.local and address.token is None:
             raise InputError(
                 f"`host` {address.host}: other machines can connect: leave `no_token` out"
@@ -326,8 +336,10 @@ def announce(
             "the connection is not encrypted"
         )
         reporter.log(f"{name}: from other machines {urls[1]}")
+    if address.public_url is not None:
+        reporter.log(f"{name}: through the proxy {address.public_url}")
     reporter.log(f"{name}: {urls[0]} (Ctrl-C ends)")
-    reporter.result({"url": urls[0]})
+    reporter.result({"url": address.public_url or urls[0]})
     if not opens_browser:
         return
 
