@@ -26,7 +26,7 @@ from spackle.core.trajectories import (
     TrajectoryKind,
     trajectory_cameras,
 )
-from spackle.formats.html import PageScene, page_scene, single_html
+from spackle.formats.html import PREVIEW_SIDE_PX, PageScene, page_scene, single_html
 from spackle.formats.scene_content import SceneFile, is_at_origin
 from spackle.formats.scene_files import encoder_for, load_scene
 from spackle.render import Renderer, get_renderer
@@ -265,6 +265,24 @@ class Scene:
             viewed_as=viewed_as,
         )
 
+    def page_file(
+        self,
+        name: str,
+        note: str = "",
+        caption: str = "",
+        viewed_as: Mapping[str, object] | None = None,
+    ) -> bytes:
+        """The bytes of an HTML file that shows the scene and its motion; it can be sent to anybody.
+
+        `name` is its title, `caption` a text below the picture; `note` and `viewed_as` as in
+        `page`.
+        """
+        page = self.page(name, note, viewed_as)
+        # Drawing a scene for the first time takes a browser seconds: until then a small picture of
+        # the same view stands there.
+        preview = self.render(page.first_view(PREVIEW_SIDE_PX)).rgb
+        return single_html(page, caption, preview)
+
     def export(self, target: PathOrFile, format: str | None = None) -> None:
         """Write a file for other viewers.
 
@@ -293,7 +311,7 @@ class Scene:
 
         def encode_page(file: SceneFile) -> bytes:
             """One HTML file with the viewer and this scene, titled by the file's name."""
-            return single_html(self.page(file.path.stem))
+            return self.page_file(file.path.stem)
 
         # A page is made of a scene with base and aux apart, not of the content of a file, so its
         # encoder is added to those of the other formats.

@@ -1,6 +1,7 @@
 // Starts the page: finds a scene, shows it, and takes further photos where there is a server.
 import { control } from "./controls.js";
 import { cameraAt, Edits } from "./edits.js";
+import { gift, title } from "./gift.js";
 import { divider, fit, panel, roomy, unfold } from "./panel.js";
 import { Queue } from "./queue.js";
 import * as source from "./source.js";
@@ -48,7 +49,10 @@ function started() {
 
 async function first() {
   const own = await source.embedded();
-  if (own) return show(own);
+  if (own) {
+    gift(viewer);
+    return show(own).then(() => (document.title = title(own.description)));
+  }
   ({ upload } = await source.current());
   element("open").hidden = !upload;
   edits.allowed = Boolean(upload);

@@ -5,6 +5,7 @@ import { disparityOf, eyeOnPath, held, pulledTo } from "./views.js";
 export const KINDS = ["swipe", "shake", "rotate", "rotate-forward"];
 const TURN_S = 8; // seconds that a path takes, there and back where it is open
 const GLIDE_S = 0.7; // seconds from where the eye is to the path
+const FIRST_GLIDE_S = 2.5; // seconds from the photo's own eye to the path
 const MOST_PIXELS = 2.6e6;
 
 const USUAL = 0.3; // disparity
@@ -21,6 +22,7 @@ export class Viewer extends EventTarget {
     this.playing = false;
     this.clock = null; // how much of a turn is gone, 0..1
     this.glide = { from: [0, 0, 0], left: 0 };
+    this.glideSeconds = GLIDE_S;
     this.frame = 0;
     this.fps = 0;
   }
@@ -33,10 +35,10 @@ export class Viewer extends EventTarget {
     this.id = id; // of the server's scene
     this.stage.show(description, layers);
     Object.assign(this.stage.zoom, { scale: 1, x: 0, y: 0 });
-    this.onPath = true;
+    this.home();
+    this.clock = null; // the path begins anew, and far from here
+    this.glideSeconds = FIRST_GLIDE_S;
     this.disparity = Math.min(USUAL, description.orbit.free);
-    this.glide.left = 0;
-    this.place();
     this.changed();
   }
 
@@ -83,7 +85,8 @@ export class Viewer extends EventTarget {
   advance(seconds) {
     this.clock = (this.clock + seconds / TURN_S) % 1;
     this.t = this.kind === "swipe" ? (1 - Math.cos(2 * Math.PI * this.clock)) / 2 : this.clock;
-    this.glide.left = Math.max(0, this.glide.left - seconds / GLIDE_S);
+    this.glide.left = Math.max(0, this.glide.left - seconds / this.glideSeconds);
+    if (!this.glide.left) this.glideSeconds = GLIDE_S;
     this.place();
     this.dispatchEvent(new Event("turn"));
   }
@@ -140,12 +143,22 @@ export class Viewer extends EventTarget {
 
   /** A hand moves the eye by so many disparities. */
   pull(dx, dy) {
-    const { unit } = this.description.orbit;
-    const [x, y, z] = this.stage.eye;
-    const from = this.pulled && !this.onPath ? this.pulled : pulledTo(this.description, [x / unit, y / unit]);
+    const from = this.pulled && !this.onPath ? this.pulled : pulledTo(this.description, this.place2d());
     this.pulled = [from[0] + dx, from[1] + dy];
-    const at = held(this.description, this.pulled);
-    this.stage.eye = [at[0] * unit, at[1] * unit, z];
+    this.lookFrom(this.pulled);
+  }
+
+  /** Where the eye is, to the right and down, in disparities. */
+  place2d() {
+    const { unit } = this.description.orbit;
+    return [this.stage.eye[0] / unit, this.stage.eye[1] / unit];
+  }
+
+  /** Put the eye so many disparities to the right and down, as far as it may go. */
+  lookFrom(place) {
+    const { unit } = this.description.orbit;
+    const at = held(this.description, place);
+    this.stage.eye = [at[0] * unit, at[1] * unit, this.stage.eye[2]];
     Object.assign(this, { onPath: false, playing: false, disparity: Math.hypot(...at) });
     this.changed();
   }

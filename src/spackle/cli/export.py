@@ -19,10 +19,14 @@ def export(
             "--output",
             metavar="FILE",
             help="Output file; the suffix sets the format: .ply, .compressed.ply, .spz, .v4.spz "
-            "(SPZ version 4, for PlayCanvas), .splat, .sog, .glb, or .html (a page with the "
-            "scene). The option may be repeated.",
+            "(SPZ version 4, for PlayCanvas), .splat, .sog, .glb, or .html (a page that shows the "
+            "picture and its motion, for sending). The option may be repeated.",
         ),
     ],
+    caption: Annotated[
+        str,
+        typer.Option(metavar="TEXT", help="Text below the picture of a page.", show_default="none"),
+    ] = "",
     as_json: JsonOption = False,
 ) -> None:
     """Write a scene in the formats that other viewers read."""
@@ -30,4 +34,4 @@ def export(
     from spackle.cli.messages import CommandReporter
     from spackle.results.saved_scene import export_scene
 
-    export_scene(scene, output, CommandReporter(as_json=as_json))
+    export_scene(scene, output, CommandReporter(as_json=as_json), caption=caption)

@@ -11,8 +11,11 @@ import base64
 import dataclasses
 import gzip
 import hashlib
+import html
+import io
 import json
 import math
+import re
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
@@ -20,10 +23,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.color import extended_linear_to_srgb, linear_to_srgb
+from spackle.core.color import extended_linear_to_srgb, linear_to_srgb, to_uint8
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
@@ -65,9 +69,22 @@ GAUSSIANS_PER_BLOCK = 1 << 16
 # The items of a description that say how the page's camera looks and moves.
 VIEWING_ITEMS = ("camera", "focus", "zNear", "orbit", "paths")
 
-# The places in the page where the style and the script are put.
+# The places in the page where the title, the icon, the photo, the style and the script are put.
+TITLE_TAG = "<title>Spackle</title>"
+ICON_TAG = '<link rel="icon" href="data:,">'
+PHOTO_TAG = '<img id="photo"'
 STYLE_TAG = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT_TAG = '<script src="viewer.js" defer></script>'
+
+# The end of a file's name, such as ".jpg", which a title does not show; but not of "Mt. Blanc".
+FILE_SUFFIX = r"(?<=.)\.[^.\s]{1,5}$"
+
+# Pixels of the long side of the picture that stands in a page until its scene is drawn, and of the
+# icon in the browser's tab.
+PREVIEW_SIDE_PX = 960
+ICON_SIDE_PX = 64
+OPEN_GRAPH_SIDE_PX = 480  # of the picture for previews of links
+PREVIEW_JPEG_QUALITY = 80
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +93,17 @@ class PageScene:
 
     description: dict[str, object]  # to be written as JSON
     files: dict[str, bytes]  # the layers, by their file names in the description
+
+    def first_view(self, long_side: int) -> Camera:
+        """The camera of the view with which the page begins, with a long side of so many pixels.
+
+        It stands at the photo's place, in the scene's own unit.
+        """
+        lens: Any = self.description["camera"]
+        factor = min(1.0, long_side / max(lens["width"], lens["height"]))
+        size = [max(1, round(lens[side] * factor)) for side in ("width", "height")]
+        view = Camera(torch.tensor(lens["K"]), torch.eye(4), lens["width"], lens["height"])
+        return view.resized(*size)
 
 
 def page_scene(
@@ -353,14 +381,20 @@ def html_safe_json(value: object) -> bytes:
     return text.encode("ascii")
 
 
-def single_html(scene: PageScene) -> bytes:
+def single_html(scene: PageScene, caption: str = "", preview: Tensor | None = None) -> bytes:
     """Return the page with a scene embedded; it opens from a disk or an e-mail.
 
-    The page fetches nothing. Its Content-Security-Policy forbids browsers to run any script in it
-    but its own.
+    It shows the picture and its motion, and all controls behind one button. The page fetches
+    nothing. Its Content-Security-Policy forbids browsers to run any script in it but its own.
+
+    Args:
+        scene: the scene, whose name is the page's title.
+        caption: a text below the picture; empty for none.
+        preview: [H, W, 3] sRGB, the photo's view; it stands in the page until the scene is drawn,
+            and is its icon. None: nothing stands there.
     """
     page = read_page_file("index.html").decode()
-    css = read_page_file("viewer.css").decode()
+    css = read_page_file("viewer.css").decode() + read_page_file("gift.css").decode()
     js = read_page_file("viewer.js").decode()
 
     embedded_files = {}
@@ -382,9 +416,45 @@ def single_html(scene: PageScene) -> bytes:
     style = f"<style>{css}</style>"
     embedded_scene = f'<script type="application/json" id="spackle-scene">{scene_json}</script>'
     script = f"<script>{js}</script>"
+    page = page.replace(TITLE_TAG, _title_tags(str(scene.description["name"]), caption, preview))
+    if preview is not None:
+        icon = _jpeg_address(preview, ICON_SIDE_PX)
+        page = page.replace(ICON_TAG, f'<link rel="icon" href="{icon}">')
+        photo = _jpeg_address(preview, PREVIEW_SIDE_PX)
+        page = page.replace(PHOTO_TAG, f'{PHOTO_TAG} src="{photo}"')
     page = page.replace(STYLE_TAG, f"{meta}\n{style}")
     page = page.replace(SCRIPT_TAG, f"{embedded_scene}\n{script}")
     return page.encode()
+
+
+def _title_tags(name: str, caption: str, preview: Tensor | None) -> str:
+    """Return the tags of a page's head that say what it is: to browsers, and to link previews.
+
+    The page reads its caption from the description.
+    """
+    # A file's name may have bytes that are no text.
+    printable_name = name.encode("utf-8", "replace").decode()
+    title = html.escape(re.sub(FILE_SUFFIX, "", printable_name))
+    tags = [
+        f"<title>{title}</title>",
+        f'<meta property="og:title" content="{title}">',
+        f'<meta property="og:description" content="{html.escape(caption)}">',
+    ]
+    if preview is not None:
+        # Programs that show previews of links want an address on the web here, which only who
+        # publishes the page can know; some take the picture itself.
+        image = _jpeg_address(preview, OPEN_GRAPH_SIDE_PX)
+        tags.append(f'<meta property="og:image" content="{image}">')
+    return "\n".join(tags)
+
+
+def _jpeg_address(picture: Tensor, side: int) -> str:
+    """Return a picture [H, W, 3] sRGB as the address data:… of a JPEG with this long side."""
+    image = Image.fromarray(to_uint8(picture.cpu()).numpy())
+    image.thumbnail((side, side), Image.Resampling.LANCZOS)
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=PREVIEW_JPEG_QUALITY, optimize=True)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
 def _policy_digest(text: str) -> str:

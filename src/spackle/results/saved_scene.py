@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import mimetypes
 import os
 import time
@@ -22,7 +23,6 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.keyframes import PathError
 from spackle.core.spherical_harmonics import degree_of_count
 from spackle.formats import save_png
-from spackle.formats.html import single_html
 from spackle.formats.scene_content import SceneFile, harmonics_loss
 from spackle.formats.scene_files import Encoder, encoder_for, load_scene
 from spackle.formats.sog import META_NAME
@@ -45,9 +45,23 @@ MAX_UNMENTIONED_HOLES = 0.01  # the log mentions holes that take a larger share 
 NO_PATH_MESSAGE = "no camera path: {reason}: give views with `cameras`"
 
 
-def encode_page(file: SceneFile) -> bytes:
-    """The bytes of an HTML file with the scene and its viewer."""
-    return single_html(Scene.of_file(file).page(page_name(file.path)))
+# Names of pages that say nothing about the picture.
+NAMES_WITHOUT_MEANING = ("scene", "page", "index")
+
+
+def encode_page(file: SceneFile, output: Path | None = None, caption: str = "") -> bytes:
+    """The bytes of an HTML file that shows the scene and its motion, to be sent to somebody.
+
+    Args:
+        file: the scene.
+        output: the file that will be written, whose name is the page's title. None, or a name that
+            says nothing: the scene's name is the title.
+        caption: a text below the picture; empty for none.
+    """
+    title = page_name(file.path)
+    if output is not None and output.stem not in NAMES_WITHOUT_MEANING:
+        title = output.stem
+    return Scene.of_file(file).page_file(title, caption=caption)
 
 
 # Formats in which a Gaussian has one colour.
@@ -314,13 +328,27 @@ def _say_if_beyond_completion(
     )
 
 
-def export_scene(scene_file: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
+def export_scene(
+    scene_file: Path, outputs: Sequence[Path], reporter: Reporter, *, caption: str = ""
+) -> None:
     """Write a scene to each output in the format of its suffix; each file whole or not at all.
 
+    Args:
+        scene_file: the scene.
+        outputs: the files to write.
+        reporter: gets messages and results.
+        caption: a text below the picture of a page; empty for none.
+
     Raises:
-        InputError: a scene or name cannot be used, or the scene is too large for a format.
+        InputError: a scene or name cannot be used, the scene is too large for a format, or there
+            is a caption, but no page.
     """
-    encoders = [encoder_for(output, PAGE_ENCODERS) for output in outputs]
+    encoders = []
+    for output in outputs:
+        page_encoder = functools.partial(encode_page, output=output, caption=caption)
+        encoders.append(encoder_for(output, {".html": page_encoder}))
+    if caption and not any(output.name.lower().endswith(".html") for output in outputs):
+        raise InputError("`caption` is for pages: give an `output` that ends in .html")
     with contextlib.ExitStack() as folders:
         # All names have to be known as good before the first file is written.
         for output in outputs:

@@ -22,7 +22,7 @@ from spackle.core.srgb_pictures import picture_to_srgb
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import DepthKind
 from spackle.formats.camera_files import camera_from_json
-from spackle.formats.html import PageScene, html_safe_json, single_html
+from spackle.formats.html import PageScene, html_safe_json
 from spackle.formats.scene_files import load_scene, scene_suffix
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import get_renderer
@@ -291,8 +291,8 @@ class SceneWork:
             scene.save_video(target, trajectory, frames=options.frames, renderer=renderer)
         elif target.suffix == ".html":
             description = json.loads((job.results / PAGE).read_bytes())
-            page = scene.page(job.name, description["note"], viewed_as=description)
-            write_atomic(target, single_html(page))
+            page = scene.page_file(job.name, description["note"], viewed_as=description)
+            write_atomic(target, page)
         else:
             scene.export(target)
 

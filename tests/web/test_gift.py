@@ -1,0 +1,157 @@
+"""The page that a person sends on: picture and motion, tools behind a button, a phone's tilt."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.browser import opened, settled
+from helpers.scenes import box_before_wall
+from helpers.web_client import eventually
+
+from spackle.core.trajectories import trajectory_cameras
+from spackle.pipeline import complete
+from spackle.scene import Scene
+
+CAPTION = 'On the <b>terrace</b>, "early"'
+# Enough of a phone for its sensor: playwright turns no phone, so the events are sent by hand.
+TURN = """([beta, gamma]) => dispatchEvent(
+    new DeviceOrientationEvent("deviceorientation", {alpha: 0, beta, gamma}))"""
+EYE = "spackle.pose().eye"
+
+
+@functools.cache
+def box() -> Scene:
+    """A small scene, completed by initial Gaussians for a disparity of 0.3."""
+    prediction = box_before_wall(width=64, height=48, focal=53).lift()
+    depths = prediction.depth_range
+    cameras = trajectory_cameras("swipe", prediction.camera.even(), 0.3, depths, 3)
+    return complete(prediction, cameras, network=None)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("gift") / "gift.html"
+    path.write_bytes(box().page_file("Our garden.jpg", caption=CAPTION))
+    return path
+
+
+@pytest.fixture
+def phone(browser: Any, file: Path) -> Iterator[Any]:
+    """The page on a phone whose owner likes motion; it must say nothing in the console."""
+    screen = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    found = opened(browser, file.as_uri(), reduced_motion="no-preference", **screen)
+    settled(found.page, "spackle.ready")
+    yield found.page
+    assert found.said == []
+    found.page.context.close()
+
+
+def test_the_page_shows_the_picture_and_its_caption_alone(browser: Any, file: Path) -> None:
+    found = opened(browser, file.as_uri())
+    page = found.page
+    page.locator("#photo").wait_for()  # stands there before the scene is drawn
+    settled(page, "spackle.ready")
+    assert page.title() == "Our garden"
+    assert page.locator("#caption").inner_text() == CAPTION
+    controls = page.locator("button, input, select, #facts").all()
+    visible = [each.get_attribute("id") for each in controls if each.is_visible()]
+    assert visible == ["corner"]
+    page.locator("#corner").click()
+    assert page.get_by_role("button", name="Save a picture").is_visible()
+    assert not page.locator("#caption").is_visible()
+    page.keyboard.press("Escape")
+    assert not page.get_by_role("button", name="Save a picture").is_visible()
+    assert found.said == []
+    page.context.close()
+
+
+def test_it_plays_at_once_and_glides_from_the_photos_own_eye(browser: Any, file: Path) -> None:
+    # Written down while the page draws, because frames are gone before a test could ask.
+    context = browser.new_context(viewport={"width": 300, "height": 225})
+    page = context.new_page()
+    page.set_default_timeout(300_000)
+    page.add_init_script("""
+        window.eyes = [];
+        (function note() {
+          if (window.spackle?.description) eyes.push(spackle.pose().eye);
+          requestAnimationFrame(note);
+        })()""")
+    page.goto(file.as_uri())
+    settled(page, "spackle.ready")
+    unit = page.evaluate("spackle.description.orbit.unit")
+    eventually(lambda: abs(page.evaluate(EYE)[0]) > 0.05 * unit)
+    eyes = page.evaluate("eyes")
+    assert eyes[0] == [0, 0, 0]
+    steps = [
+        max(abs(after[axis] - before[axis]) for axis in range(3)) / unit
+        for before, after in itertools.pairwise(eyes)
+    ]
+    # However slow the machine, a frame advances by at most a quarter of a second.
+    assert max(steps) < 0.1
+    context.close()
+
+
+def test_who_likes_no_motion_gets_a_still_picture(browser: Any, file: Path) -> None:
+    page = opened(browser, file.as_uri(), reduced_motion="reduce").page
+    settled(page, "spackle.ready")
+    for gamma in (0, 10, 15):
+        page.evaluate(TURN, [45, gamma])
+    assert page.evaluate(EYE) == [0, 0, 0]
+    page.context.close()
+
+
+def test_the_eye_follows_a_turned_phone_within_the_filled_range(phone: Any) -> None:
+    unit = phone.evaluate("spackle.description.orbit.unit")
+    phone.evaluate("spackle.setView('swipe', 0, 0.5)")
+    phone.evaluate(TURN, [45, 0])
+    phone.evaluate(TURN, [46, 1])  # a hand is never quite still
+    assert phone.evaluate(EYE) == [0, 0, 0]
+    for step in range(8):  # to the right, in steps of a sensor
+        phone.evaluate(TURN, [45, 2 * step])
+        phone.wait_for_timeout(30)
+    right = phone.evaluate(EYE)
+    assert right[0] < -0.02 * unit  # one sees it from farther left
+    for step in range(40):
+        phone.evaluate(TURN, [45, min(14 + 4 * step, 85)])
+        phone.wait_for_timeout(30)
+    limit = phone.evaluate("spackle.description.orbit.limit")
+    far = phone.evaluate(EYE)
+    assert 0.25 * unit < abs(far[0]) <= limit * unit * (1 + 1e-9)
+    # A sensor that flips its angles moves nothing.
+    phone.evaluate(TURN, [-135, -85])
+    assert phone.evaluate(EYE) == far
+
+
+def test_a_browser_that_asks_for_permission_is_asked_in_a_tap(browser: Any, file: Path) -> None:
+    context = browser.new_context(has_touch=True, viewport={"width": 390, "height": 844})
+    page = context.new_page()
+    page.set_default_timeout(300_000)
+    page.add_init_script("""
+        window.asked = 0;
+        DeviceOrientationEvent.requestPermission = async () => (window.asked++, "granted");""")
+    page.goto(file.as_uri())
+    settled(page, "spackle.ready")
+    assert page.evaluate("asked") == 0
+    for _ in range(2):
+        page.locator("#view").tap()
+        eventually(lambda: page.evaluate("asked") == 1)
+    context.close()
+
+
+def test_a_tap_stops_the_motion_and_two_go_back_to_the_photo(phone: Any) -> None:
+    playing = "document.getElementById('play').classList.contains('on')"
+    assert phone.evaluate(playing)
+    phone.locator("#view").tap()
+    eventually(lambda: not phone.evaluate(playing))
+    phone.evaluate("spackle.setView('swipe', 0.2, 1)")
+    assert phone.evaluate(EYE)[0] > 0
+    view = phone.locator("#view").bounding_box()
+    place = (view["x"] + view["width"] / 2, view["y"] + view["height"] / 2)
+    phone.touchscreen.tap(*place)
+    phone.touchscreen.tap(*place)
+    eventually(lambda: phone.evaluate(EYE) == [0, 0, 0])

@@ -1,0 +1,74 @@
+// A page that somebody was sent: the picture and its motion, and everything else behind one small button.
+import { tilt } from "./tilt.js";
+
+const TAP_MS = 300; // two taps within this time are a double tap
+const TAP_PIXELS = 12; // a finger that moves farther drags
+const SLIDERS = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M4 7h10M18 7h2M4 17h2M10 17h10"/><circle cx="16" cy="7" r="2.2"/><circle cx="8" cy="17" r="2.2"/></svg>';
+
+/** Prepare the page of a file. Its scene is shown afterwards. */
+export function gift(viewer) {
+  document.body.classList.add("gift");
+  backdrop();
+  caption();
+  corner();
+  taps(viewer);
+  tilt(viewer);
+}
+
+/** What the page is called: the scene's name, without the end of a file's. */
+export function title({ name }) {
+  return name.replace(/(?<=.)\.[^.\s]{1,5}$/, "");
+}
+
+/** The photo, blurred, fills what the picture leaves of the window. */
+function backdrop() {
+  const photo = document.getElementById("photo");
+  if (!photo.src) return;
+  document.body.prepend(Object.assign(new Image(), { id: "backdrop", alt: "", src: photo.src }));
+  document.getElementById("frame").hidden = false; // the photo stands there until the scene is drawn
+  document.getElementById("frame").classList.add("waiting");
+}
+
+/** What the sender wrote, below the picture. */
+function caption() {
+  const text = document.querySelector('meta[property="og:description"]')?.content;
+  if (text) document.getElementById("area").after(Object.assign(document.createElement("p"), { id: "caption", textContent: text }));
+}
+
+/** The button that shows the tools, and hides them again. */
+function corner() {
+  const button = Object.assign(document.createElement("button"), { type: "button", id: "corner", innerHTML: SLIDERS });
+  const open = (on) => {
+    document.body.classList.toggle("tools", on);
+    button.setAttribute("aria-expanded", on);
+    button.setAttribute("aria-label", on ? "Hide the tools" : "Tools");
+    button.title = on ? "Hide the tools (Esc)" : "Tools: save a picture or a video, compare, and more";
+  };
+  button.onclick = () => open(!document.body.classList.contains("tools"));
+  addEventListener("keydown", ({ key }) => key === "Escape" && open(false));
+  open(false);
+  document.body.append(button);
+}
+
+/** A tap lets the picture move or stand, and two show the photo's own view. */
+function taps(viewer) {
+  const { canvas } = viewer;
+  let down = null;
+  let timer = null;
+  canvas.addEventListener("pointerdown", (event) => (down = event.isPrimary ? event : null));
+  canvas.addEventListener("pointerup", (event) => {
+    const isTap = down && Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) < TAP_PIXELS;
+    down = null;
+    if (!isTap || !viewer.description || event.button) return;
+    if (timer) {
+      clearTimeout(timer);
+      timer = null;
+      return viewer.home();
+    }
+    timer = setTimeout(() => {
+      timer = null;
+      if (viewer.playing) viewer.pause();
+      else viewer.play();
+    }, TAP_MS);
+  });
+}
