@@ -28,10 +28,24 @@ from spackle.bases.settings import AUTO
 from spackle.core.image_formats import PHOTO_SUFFIXES
 from spackle.formats.html import read_page_file
 from spackle.runtime.task_process import TaskFunction
-from spackle.web.guard import MAX_UPLOAD_BYTES, Access, Guard
+from spackle.web.description import (
+    ACCEPTED,
+    ANY_FORM,
+    DELETED,
+    FILE,
+    MEDIA_TYPES,
+    OCTETS,
+    REASONS,
+    STATE,
+    DescribedApp,
+    refusals,
+    resolve,
+)
+from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, Access, Guard
 from spackle.web.jobs import Job, Jobs, RetentionLimits, SceneState
 from spackle.web.uploads import (
     FILL_FORM,
+    FORM_MODELS,
     REMOVAL_FORM,
     UPLOAD_FORM,
     accept_fill,
@@ -41,6 +55,7 @@ from spackle.web.uploads import (
 from spackle.web.work import PREVIEW, Download, FileName, SceneWork, Video
 
 SCENES_PATH = "/api/v1/scenes"
+DOCS_PATH = "/api/v1/docs"
 # What the page draws.
 PagePart = Literal[
     "page.json",
@@ -90,15 +105,21 @@ def create_app(
         yield
         jobs.close()
 
-    app = FastAPI(
+    app = DescribedApp(
         title="Spackle",
         version=spackle.__version__,
         openapi_url="/api/v1/openapi.json",
         docs_url=None,
         redoc_url=None,
         lifespan=close_jobs_at_the_end,
-        exception_handlers=dict.fromkeys((HTTPException, RequestValidationError), error_answer),
+        exception_handlers={
+            HTTPException: error_answer,
+            RequestValidationError: error_answer,
+            Exception: fault_answer,
+        },
     )
+    app.needs_token = access is not None and access.token is not None
+    app.form_models = FORM_MODELS
     app.state.jobs = jobs
     app.add_middleware(Guard, access=access, max_bytes=max_bytes)
 
@@ -115,47 +136,87 @@ def create_app(
 
 def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
     """Add the HTTP interface to an app: the routes below /api/v1/scenes."""
-    form = {"requestBody": {"content": {"multipart/form-data": UPLOAD_FORM}}}
     one_scene = SCENES_PATH + "/{id}"
-    app.add_api_route(
-        SCENES_PATH, handlers.post_photo, methods=["POST"], status_code=202, openapi_extra=form
-    )
-    for path, handler, fields in (
-        ("/fill", handlers.post_fill, FILL_FORM),
-        ("/remove", handlers.post_removal, REMOVAL_FORM),
-    ):
-        form = {"requestBody": {"content": {"multipart/form-data": fields}}}
+
+    def add(method: str, path: str, handler: Callable[..., Any], **details: Any) -> None:
+        """Add a route, which generated clients call by the name of its handler."""
         app.add_api_route(
-            one_scene + path, handler, methods=["POST"], status_code=202, openapi_extra=form
+            path,
+            handler,
+            methods=[method],
+            operation_id=handler.__name__,
+            tags=["scenes"],
+            **details,
         )
-    app.add_api_route(one_scene, handlers.get_state, methods=["GET"])
-    app.add_api_route(one_scene, handlers.delete, methods=["DELETE"], status_code=204)
-    app.add_api_route(
+
+    add(
+        "POST",
+        SCENES_PATH,
+        handlers.post_photo,
+        status_code=202,
+        openapi_extra=UPLOAD_FORM,
+        responses={**ACCEPTED, **refusals(*ANY_FORM, 415)},
+    )
+    add(
+        "POST",
+        one_scene + "/fill",
+        handlers.post_fill,
+        status_code=202,
+        openapi_extra=FILL_FORM,
+        responses={**ACCEPTED, **refusals(*ANY_FORM, 404, 409)},
+    )
+    add(
+        "POST",
+        one_scene + "/remove",
+        handlers.post_removal,
+        status_code=202,
+        openapi_extra=REMOVAL_FORM,
+        responses={**ACCEPTED, **refusals(*ANY_FORM, 404, 409, 415)},
+    )
+    add("GET", one_scene, handlers.get_state, responses={**STATE, **refusals(404)})
+    add(
+        "DELETE",
+        one_scene,
+        handlers.delete_scene,
+        status_code=204,
+        responses={**DELETED, **refusals(404)},
+    )
+    add(
+        "GET",
         one_scene + "/events",
         handlers.get_events,
-        methods=["GET"],
         response_class=EventSourceResponse,
+        responses=refusals(),
     )
-    app.add_api_route(
+    add(
+        "GET",
         one_scene + "/files/{file}",
         handlers.get_file,
-        methods=["GET"],
         response_class=FileResponse,
+        responses={**FILE, **refusals(404, 409)},
     )
 
 
 def add_page_routes(app: FastAPI, handlers: SceneHandlers) -> None:
     """Add the page and its files to an app, and the description of the HTTP interface."""
 
-    async def get_docs() -> HTMLResponse:
+    async def get_docs(request: Request) -> HTMLResponse:
         """A page that describes the HTTP interface, from its OpenAPI description."""
         template = Template(read_page_file("docs.html").decode(), autoescape=True)
-        return HTMLResponse(template.render(api=app.openapi()))
+        description = app.openapi()
+        content = template.render(
+            api=description,
+            resolve=functools.partial(resolve, description),
+            # How the page's addresses lead back to the root, where its style lies.
+            up="../../" if request.url.path.endswith(DOCS_PATH) else "",
+        )
+        return HTMLResponse(content)
 
     # These routes serve the page and are no part of the interface for programs.
     app.add_api_route("/page.json", handlers.get_page_state, include_in_schema=False)
     app.add_api_route("/healthz", handlers.get_health, include_in_schema=False)
-    app.add_api_route("/docs", get_docs, include_in_schema=False)
+    for path in ("/docs", DOCS_PATH):
+        app.add_api_route(path, get_docs, include_in_schema=False)
     # The last route, because it takes every other path.
     app.mount("/", StaticFiles(packages=[("spackle.web", "page")], html=True))
 
@@ -244,7 +305,7 @@ class SceneHandlers:
         """The state of a photo and its files."""
         return state_with_files(self.find_job(id))
 
-    async def delete(self, id: str) -> None:
+    async def delete_scene(self, id: str) -> None:
         """Delete a photo and its scene, and end work on it."""
         job = self.find_job(id)
         await run_in_threadpool(self.jobs.remove, job.id)
@@ -282,7 +343,11 @@ class SceneHandlers:
             error = await asyncio.shield(future_error)
             if error is not None:
                 raise HTTPException(404, error)
-        return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)
+        return FileResponse(
+            path,
+            filename=PurePosixPath(job.name).stem + path.suffix,
+            media_type=MEDIA_TYPES.get(path.suffix, OCTETS),
+        )
 
     async def get_page_state(self) -> dict[str, object]:
         """What the page may send: kinds of files, size limit, and networks to choose from.
@@ -340,6 +405,11 @@ async def error_answer(request: Request, error: Any) -> JSONResponse:
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
     return JSONResponse({"error": "there is nothing with that name"}, 404)
+
+
+async def fault_answer(request: Request, error: Exception) -> JSONResponse:
+    """The answer to a request at which the server has a fault, which `Guard` has logged."""
+    return JSONResponse({"error": REASONS[500][1]}, 500, SECURITY_HEADERS)
 
 
 def make_server(app: FastAPI) -> uvicorn.Server:

@@ -24,6 +24,7 @@ from spackle.depth.readers import DEPTH_SUFFIXES
 from spackle.formats.camera_files import CameraEntry, camera_from_json
 from spackle.runtime.errors import InputError, printable_line, unknown_name
 from spackle.runtime.validation import validation_problem
+from spackle.web.description import BINARY_FILE, describe_form
 from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, sent_mask
 from spackle.web.jobs import Edit, Job, Jobs
 from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions, check_photo
@@ -37,53 +38,6 @@ PHOTO_DESCRIPTION = (
     "A photo; its content decides, not its name. The usual names end in "
     f"{', '.join(PHOTO_SUFFIXES)}."
 )
-BINARY_FILE = {"type": "string", "format": "binary"}
-
-
-def _edit_form(options: type[BaseModel], **files: dict[str, str]) -> dict[str, Any]:
-    """The form of an edit in the description of the HTTP interface.
-
-    Args:
-        options: the model of its field `options`, which is JSON.
-        **files: the descriptions of its files, by their names.
-    """
-    schema = options.model_json_schema()
-    # pydantic describes a camera once, and refers to it where it is used. Such references would not
-    # be found from within the whole interface, so the description is put in their place.
-    camera = schema.pop("$defs")["CameraEntry"]
-    for field in schema["properties"].values():
-        if "$ref" in field:  # a field with one camera; all others are lists of cameras
-            del field["$ref"]
-            field.update({**camera, "description": field["description"]})
-        else:
-            field["items"] = camera
-    return {
-        "schema": {
-            "type": "object",
-            "required": [*files, "options"],
-            "properties": {**files, "options": schema},
-        },
-        "encoding": {"options": {"contentType": "application/json"}},
-    }
-
-
-# The form in the description of the HTTP interface. It is not declared as a parameter, because
-# FastAPI would then read it before the queue has a place.
-UPLOAD_FORM: dict[str, Any] = {
-    "schema": {
-        "type": "object",
-        "required": ["photo"],
-        "properties": {
-            "photo": {**BINARY_FILE, "description": PHOTO_DESCRIPTION},
-            "depth": {
-                **BINARY_FILE,
-                "description": f"Its depth map, one of {', '.join(DEPTH_SUFFIXES)}.",
-            },
-            "options": SceneOptions.model_json_schema(),
-        },
-    },
-    "encoding": {"options": {"contentType": "application/json"}},
-}
 
 
 class FillRequest(BaseModel):
@@ -110,13 +64,22 @@ class RemovalRequest(BaseModel):
     )
 
 
-FILL_FORM = _edit_form(FillRequest)
+# The forms in the description of the HTTP interface. They are not declared as parameters, because
+# FastAPI would then read a form before the queue has a place.
+UPLOAD_FORM = describe_form(
+    SceneOptions,
+    "photo",
+    photo={**BINARY_FILE, "description": PHOTO_DESCRIPTION},
+    depth={**BINARY_FILE, "description": f"Its depth map, one of {', '.join(DEPTH_SUFFIXES)}."},
+)
+FILL_FORM = describe_form(FillRequest, "options")
 MASK_FIELD = {
     **BINARY_FILE,
     "description": "A picture of the view's shape: white where the thing is, "
     "black or transparent elsewhere.",
 }
-REMOVAL_FORM = _edit_form(RemovalRequest, mask=MASK_FIELD)
+REMOVAL_FORM = describe_form(RemovalRequest, "mask", "options", mask=MASK_FIELD)
+FORM_MODELS = (SceneOptions, FillRequest, RemovalRequest)  # of the fields `options`
 
 
 def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[str]) -> Job:
