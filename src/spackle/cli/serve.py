@@ -35,14 +35,15 @@ def serve(
         ),
     ] = None,
     workers: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=1,
             max=64,
             help="Number of processes that share the photos, each with its own copy of the base's "
-            "network.",
+            "network; default: one for each GPU, or one.",
+            show_default=False,
         ),
-    ] = 1,
+    ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Folder of photos and scenes.")
     ] = Path("spackle-scenes"),

@@ -63,6 +63,17 @@ def pick_device(device: torch.device | str | None) -> torch.device:
     return picked
 
 
+def use_gpu(number: int | None) -> None:
+    """Let this process compute on one of this machine's GPUs, unless a computation names another.
+
+    Args:
+        number: counts worker processes from 0; with more processes than GPUs, several share one.
+            None leaves the GPU that torch uses.
+    """
+    if number is not None and torch.cuda.device_count() > 1:
+        torch.cuda.set_device(number % torch.cuda.device_count())
+
+
 @contextmanager
 def report_memory_shortage(*advice: str, what: str = "for the network") -> Iterator[None]:
     """Turn a shortage of memory in the block, on the CPU or GPU, into a `NotEnoughMemory`.

@@ -24,11 +24,19 @@ TaskFunction = Callable[[Any, SendEvent], None]
 class TaskProcess:
     """A worker process and the connection to it."""
 
-    def __init__(self, work: TaskFunction) -> None:
-        """Start the process, which will call `work` for each task."""
+    def __init__(self, work: TaskFunction, gpu_number: int | None = None) -> None:
+        """Start the process, which will call `work` for each task.
+
+        Args:
+            work: does a task.
+            gpu_number: number of the GPU on which the process computes, modulo the number of this
+                machine's GPUs; None: the GPU that torch uses by default.
+        """
         spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
         self._pipe, worker_pipe = spawn.Pipe()
-        self._process = spawn.Process(target=_serve, args=(worker_pipe, work), daemon=True)
+        self._process = spawn.Process(
+            target=_serve, args=(worker_pipe, work, gpu_number), daemon=True
+        )
         self._process.start()
         # Only the worker may hold its end, so that the pipe breaks when the worker dies.
         worker_pipe.close()
@@ -64,13 +72,18 @@ class TaskProcess:
         return error
 
 
-def _serve(pipe: connection.Connection, work: TaskFunction) -> None:
+def _serve(pipe: connection.Connection, work: TaskFunction, gpu_number: int | None) -> None:
     """Run in the worker process: do the tasks that come through the pipe until it closes.
 
-    After each task, None is sent, or a line with the reason for its failure.
+    After each task, None is sent, or a line with the reason for its failure. The number of the GPU
+    is that of `TaskProcess`.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     threading.Thread(target=end_with_parent, daemon=True).start()
+    if gpu_number is not None:
+        from spackle.runtime.device import use_gpu  # only here, because it loads torch
+
+        use_gpu(gpu_number)
     while True:
         error = None
         try:

@@ -36,9 +36,7 @@ class WorkerOptions:
             job_count: number of jobs; there are no more processes than jobs.
         """
         if ray is None and count is None:
-            # A GPU with a number is the only one that the user wants.
-            any_gpu = device in ("auto", "cuda")
-            count = max(torch.cuda.device_count(), 1) if any_gpu else 1
+            count = gpu_worker_count(device)
         if count is not None:
             count = max(1, min(count, job_count))
         if threads is None:
@@ -49,6 +47,17 @@ class WorkerOptions:
     def in_this_process(self) -> bool:
         """Whether the calling process does all jobs."""
         return self.ray is None and self.count == 1
+
+
+def gpu_worker_count(device: str) -> int:
+    """The number of worker processes on this machine: one for each GPU that may be used, or one.
+
+    Args:
+        device: "auto", "cpu", "cuda", or one GPU, such as "cuda:1".
+    """
+    # A GPU with a number is the only one that the user wants.
+    any_gpu = device in ("auto", "cuda")
+    return max(torch.cuda.device_count(), 1) if any_gpu else 1
 
 
 def this_process() -> WorkerOptions:

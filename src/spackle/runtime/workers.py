@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from spackle.runtime.device import use_gpu
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import end_with_parent
 from spackle.runtime.worker_options import WorkerOptions
@@ -145,10 +146,7 @@ def _start_process(threads: int, open_worker: Callable[[], Any], gpu_numbers: An
     threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
 
-    # With more processes than GPUs, several processes share one.
-    gpu_number = gpu_numbers.get()
-    if gpu_number is not None and torch.cuda.device_count() > 1:
-        torch.cuda.set_device(gpu_number % torch.cuda.device_count())
+    use_gpu(gpu_numbers.get())
 
 
 def _make(job: Any) -> Any:

@@ -115,7 +115,8 @@ class Jobs:
             work: takes (job, file) in a worker process, and reports {stage, done, total} or {line}.
                 If `file` is None, it makes a scene of the photo; else it adds this file to a
                 finished scene.
-            workers: number of processes that make scenes.
+            workers: number of processes that make scenes; each has a GPU of its own if there are
+                enough.
             keep: limits of the folder.
 
         Raises:
@@ -133,7 +134,10 @@ class Jobs:
         self._processes: list[TaskProcess] = []
         self._own_process = threading.local()  # the process of the calling thread
         self._process_of_job: dict[str, TaskProcess] = {}  # by the id of a running job
-        self._scene_threads = ThreadPoolExecutor(workers)
+        # Each process that makes scenes has a number, which chooses its GPU. A single process, and
+        # the one that adds files, have none: they use torch's default GPU.
+        self._gpu_numbers = iter(range(workers) if workers > 1 else ())
+        self._scene_threads = ThreadPoolExecutor(workers, initializer=self._take_gpu_number)
         self._file_thread = ThreadPoolExecutor(1)
 
         # A process takes seconds to start: it does so while the first photo is uploaded.
@@ -261,6 +265,10 @@ class Jobs:
             pool.shutdown(cancel_futures=True)
         self._folder_lock.close()  # another server may open the folder
 
+    def _take_gpu_number(self) -> None:
+        """Give the calling thread, and so its process, the next number of a GPU, if any is left."""
+        self._own_process.gpu_number = next(self._gpu_numbers, None)
+
     def _process(self) -> TaskProcess:
         """The worker process of the calling thread; a new one if there is none, or it died."""
         # `_own_process` holds another value in each thread.
@@ -270,7 +278,9 @@ class Jobs:
             # returned dead, and the tasks that it gets fail.
             is_dead = process is not None and not process.alive
             if process is None or (is_dead and not self._is_closed.is_set()):
-                process = TaskProcess(self._work)
+                # A process that replaces a dead one takes over its GPU.
+                gpu_number = getattr(self._own_process, "gpu_number", None)
+                process = TaskProcess(self._work, gpu_number)
                 self._own_process.process = process
                 alive = [each for each in self._processes if each.alive]
                 self._processes = [*alive, process]

@@ -25,6 +25,7 @@ from spackle.results.saved_scene import log_losses, page_name
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Reporter, catch_stop_signals
+from spackle.runtime.worker_options import gpu_worker_count
 from spackle.scene import Scene
 from spackle.views import PathOptions
 from spackle.web.app import create_app, make_server
@@ -191,7 +192,7 @@ def _add_target(jobs: Jobs, target: Path, title: str, options: ViewOptions) -> s
 def serve_programs(
     folder: Path,
     work: SceneWork,
-    workers: int,
+    workers: int | None,
     limits: RetentionLimits,
     address: ServerAddress,
     reporter: Reporter,
@@ -201,7 +202,7 @@ def serve_programs(
     Args:
         folder: the folder of photos and scenes.
         work: what a worker process does with a photo.
-        workers: the number of worker processes.
+        workers: the number of worker processes; None: one for each GPU, or one.
         limits: how long and how many scenes are kept.
         address: where the server listens.
         reporter: gets messages and results.
@@ -210,6 +211,8 @@ def serve_programs(
         InputError: an option cannot be used.
     """
     work.base.check()
+    if workers is None:
+        workers = gpu_worker_count(work.base.device)
     with run_server(folder, work, workers, limits, address, reporter) as (_, urls):
         reporter.log(
             f"token: {address.token} (send it as `Authorization: Bearer TOKEN`, "
