@@ -21,6 +21,7 @@ from PIL import Image
 from helpers import web_work
 from helpers.photos import picture
 from spackle.web.app import create_app, make_server
+from spackle.web.callbacks import CallbackSender
 from spackle.web.guard import Access
 from spackle.web.jobs import Jobs, RetentionLimits
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
@@ -119,6 +120,7 @@ def served(
     max_bytes: int = MAX_BYTES,
     keep: RetentionLimits = RetentionLimits(),  # noqa: B008
     public: PublicAddress = LOCAL_ONLY,
+    callbacks: CallbackSender | None = None,
 ) -> Iterator[Served]:
     with socket.socket() as listener:
         listener.bind((host, 0))
@@ -130,6 +132,7 @@ def served(
             keep=keep,
             access=Access.for_listener(host, address, token, public),
             max_bytes=max_bytes,
+            callbacks=callbacks,
         )
         server = make_server(app)
         thread = threading.Thread(target=server.run, args=([listener],))

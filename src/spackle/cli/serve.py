@@ -84,6 +84,14 @@ def serve(
             "may be repeated.",
         ),
     ] = None,
+    callback_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="HOST",
+            help="A host that may be told that a scene is done, if a client sends callback_url; "
+            "may be repeated.",
+        ),
+    ] = None,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")
     ] = "auto",
@@ -121,6 +129,7 @@ def serve(
                 url=public_url,
                 proxies=tuple(proxy or ()),
             ),
+            callback_hosts=tuple(callback_host or ()),
         ),
         CommandReporter(verbose, as_json=as_json),
     )

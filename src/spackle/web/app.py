@@ -28,6 +28,7 @@ from spackle.bases.settings import AUTO
 from spackle.core.image_formats import PHOTO_SUFFIXES
 from spackle.formats.html import read_page_file
 from spackle.runtime.task_process import TaskFunction
+from spackle.web.callbacks import CallbackSender
 from spackle.web.description import (
     ACCEPTED,
     ANY_FORM,
@@ -84,6 +85,7 @@ def create_app(
     keep: RetentionLimits = DEFAULT_LIMITS,
     access: Access | None = None,
     max_bytes: int = MAX_UPLOAD_BYTES,
+    callbacks: CallbackSender | None = None,
 ) -> FastAPI:
     """An app to serve alone, or to mount in another app, which must then control access.
 
@@ -97,8 +99,10 @@ def create_app(
         keep: limits of the folder: age and size of scenes, and number of waiting photos.
         access: token and host that requests are checked against; None leaves checks to the caller.
         max_bytes: size limit of an upload, including its depth map.
+        callbacks: tells clients' servers that scenes are done; None: it tells nobody.
     """
-    jobs = Jobs(folder, work, workers, keep)
+    jobs = Jobs(folder, work, workers, keep, callbacks)
+    jobs.start_callbacks(state_with_files)
 
     @contextlib.asynccontextmanager
     async def close_jobs_at_the_end(app: FastAPI) -> AsyncIterator[None]:
@@ -284,8 +288,9 @@ class SceneHandlers:
         # The place is reserved first, so that a refused photo is not even received.
         with self.jobs.reserve_place() as upload_folder:
             try:
-                # Two files, such as the photo and its depth map. One text field: the options.
-                reading = request.form(max_files=2, max_fields=1)
+                # Two files, such as the photo and its depth map. Two text fields: the options, and
+                # the address to call at the end.
+                reading = request.form(max_files=2, max_fields=2)
                 form = await asyncio.wait_for(reading, MAX_UPLOAD_S)
             except asyncio.TimeoutError:
                 raise HTTPException(408, "the photo arrived too slowly") from None

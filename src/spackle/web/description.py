@@ -14,6 +14,12 @@ from pydantic import BaseModel, Field
 JSON = "application/json"
 OCTETS = "application/octet-stream"
 BINARY_FILE = {"type": "string", "format": "binary"}
+CALLBACK_FIELD = {
+    "type": "string",
+    "format": "uri",
+    "description": "An address on a host that the server may call: the state is sent there at the "
+    "end, signed with the token.",
+}
 SCHEMA_PLACE = "#/components/schemas/{model}"  # where a description refers to a model
 # The kinds of files that clients get, by suffix; others are OCTETS. A fixed table, because the
 # usual one depends on the operating system.
@@ -138,7 +144,7 @@ def describe_form(
     schema = {
         "type": "object",
         "required": list(required),
-        "properties": {**files, "options": options_schema},
+        "properties": {**files, "options": options_schema, "callback_url": CALLBACK_FIELD},
     }
     encoding = {"options": {"contentType": JSON}}
     content = {"multipart/form-data": {"schema": schema, "encoding": encoding}}

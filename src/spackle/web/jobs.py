@@ -9,7 +9,7 @@ import secrets
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -22,6 +22,7 @@ from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import StageProgress
 from spackle.runtime.task_process import WORKER_DIED, TaskEvent, TaskFunction, TaskProcess
+from spackle.web.callbacks import CallbackSender
 
 LOG = logging.getLogger("spackle.web")
 RECORD_FILE = "job.json"  # stores the state of a job, in the folder of the job
@@ -85,6 +86,7 @@ class Job(SceneState):
     # Of an edit: the views to fill, or the view in which the mask was drawn, as JSON; the mask.
     cameras: list[dict[str, Any]] = []
     mask: str | None = None
+    callback_url: str | None = None  # is told the state at the end; None afterwards
     folder: Path = Field(default=Path(), exclude=True)
 
     @property
@@ -106,7 +108,12 @@ class Jobs:
     """
 
     def __init__(
-        self, folder: Path, work: TaskFunction, workers: int, keep: RetentionLimits
+        self,
+        folder: Path,
+        work: TaskFunction,
+        workers: int,
+        keep: RetentionLimits,
+        callbacks: CallbackSender | None = None,
     ) -> None:
         """Open a folder of jobs, start the processes, and go on with unfinished jobs.
 
@@ -118,12 +125,14 @@ class Jobs:
             workers: number of processes that make scenes; each has a GPU of its own if there are
                 enough.
             keep: limits of the folder.
+            callbacks: tells clients the end of their jobs; None: nobody is told.
 
         Raises:
             InputError: another server uses the folder, or it cannot be used.
         """
         self.folder = folder
         self.limits = keep
+        self.callbacks = CallbackSender((), "") if callbacks is None else callbacks
         self._folder_lock = contextlib.ExitStack()
         self._folder_lock.enter_context(results_folder(folder, locked=True))
 
@@ -160,6 +169,35 @@ class Jobs:
             if job.ended is None:
                 self._change(job.id, state="queued")
                 self._scene_threads.submit(self._run, job.id)
+
+    def start_callbacks(self, describe: Callable[[Job], SceneState]) -> None:
+        """Tell clients the end of their jobs from now on, also of jobs that have ended before.
+
+        Args:
+            describe: returns the state of a job as clients see it.
+        """
+
+        def state_of(id: str) -> bytes | None:
+            """The state of the job with an id, as JSON; None if it was deleted."""
+            job = self.by_id.get(id)
+            if job is None:
+                return None
+            state = describe(job)
+            return state.model_dump_json(include=set(SceneState.model_fields)).encode()
+
+        self.callbacks.start(state_of, self._forget_callback)
+        for job in list(self.by_id.values()):
+            if job.ended is not None and job.callback_url is not None:
+                self.callbacks.schedule(job.id, job.callback_url)
+
+    def _forget_callback(self, id: str) -> None:
+        """Note that nobody is to be told the end of a job any more."""
+        with self._lock:
+            self._change(id, callback_url=None)
+            # If the disk is full, or the job has just been deleted, there is nothing to be done.
+            if id in self.by_id:
+                with contextlib.suppress(InputError, OSError):
+                    self.by_id[id].save()
 
     def _change(self, id: str, **values: object) -> None:
         """Set fields of the state of a job, unless `remove` has deleted the job."""
@@ -199,6 +237,7 @@ class Jobs:
         depth: str | None,
         options: dict[str, Any],
         edit: Edit | None = None,
+        callback_url: str | None = None,
     ) -> Job:
         """Add a job for a photo or for an edit of a scene, and queue it; returns the job.
 
@@ -209,9 +248,18 @@ class Jobs:
             depth: its depth map, in the same way; None if there is none.
             options: what the client has set.
             edit: what is to be done to the scene in the file `source`; None for a photo.
+            callback_url: an address that `callbacks` accepts, which is told the end; or None.
         """
         id = folder.name.removeprefix(UPLOAD_PREFIX)
-        job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
+        job = Job(
+            id=id,
+            name=name,
+            source=source,
+            depth=depth,
+            options=options,
+            callback_url=callback_url,
+            folder=folder,
+        )
         if edit is not None:
             # A job has the parts of its edit as fields of its own; the kind is the field `edit`.
             parts = edit._asdict()
@@ -258,6 +306,7 @@ class Jobs:
         """Kill the processes; jobs resume when a server next opens the folder."""
         with self._lock:
             self._is_closed.set()
+            self.callbacks.close()
             for process in self._processes:
                 process.kill()
         # The threads see that their processes are gone, and end.
@@ -353,6 +402,8 @@ class Jobs:
                     if file is not None and not os.path.isabs(file):
                         (job.folder / file).unlink(missing_ok=True)
             self.by_id[id] = ended_job
+        if ended_job.callback_url is not None:
+            self.callbacks.schedule(id, ended_job.callback_url)
         if error:
             LOG.error("error: %s", error)
 

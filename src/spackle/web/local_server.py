@@ -29,6 +29,7 @@ from spackle.runtime.worker_options import gpu_worker_count
 from spackle.scene import Scene
 from spackle.views import PathOptions
 from spackle.web.app import create_app, make_server
+from spackle.web.callbacks import CallbackSender
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, RetentionLimits
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
@@ -50,6 +51,7 @@ class ServerAddress:
     port: int  # 0: any free port
     token: str | None  # the secret that a client must know; None: everybody on this machine may
     public: PublicAddress = LOCAL_ONLY  # names outside of this machine, and proxies
+    callback_hosts: tuple[str, ...] = ()  # hosts that may be told that scenes are done
 
     def url_at(self, host: str, port: int) -> str:
         """The page's address, with the token, at a host and the port that was found."""
@@ -264,7 +266,14 @@ def run_server(
             hosts.append(address_in_network(address.host))
         urls = [address.url_at(host, port) for host in hosts]
 
-        app = create_app(folder, work, workers=workers, keep=limits, access=access)
+        app = create_app(
+            folder,
+            work,
+            workers=workers,
+            keep=limits,
+            access=access,
+            callbacks=CallbackSender(address.callback_hosts, address.token or ""),
+        )
         with contextlib.closing(app.state.jobs) as jobs:
             # The socket accepts connections already, so the caller may announce the page now.
             yield jobs, urls

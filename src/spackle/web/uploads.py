@@ -92,8 +92,8 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
         bases: the names of the bases, the networks for a photo's geometry, that may be chosen.
 
     Raises:
-        HTTPException: 422 for a bad form or bad options, 400 for an empty file, 415 for a file that
-            is no photo of an accepted kind.
+        HTTPException: 422 for a bad form, bad options or a bad `callback_url`, 400 for an empty
+            file, 415 for a file that is no photo of an accepted kind.
     """
     # A form may hold anything: several photos, text in place of a file, a file in place of text.
     photo = form.get("photo")
@@ -104,6 +104,7 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
             422, "send one photo as the file `photo`, and the options as the text `options`"
         )
     assert isinstance(photo, UploadFile)  # tells the type checker what is already known
+    callback_url = jobs.callbacks.check(form.get("callback_url"))
     photo_name = safe_display_name(photo.filename or "")
     options = read_options(options_text, bases)
 
@@ -127,6 +128,7 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
         source=photo_file,
         depth=depth_file,
         options=given_options,
+        callback_url=callback_url,
     )
 
 
@@ -139,7 +141,9 @@ def accept_fill(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: Job)
     cameras = [camera.model_dump() for camera in request.cameras]
     for index, camera in enumerate(cameras):
         _check_view(camera, f"cameras.{index}")
-    return _add_edit(Edit("fill", parent.id, cameras), upload_folder, jobs, parent)
+    edit = Edit("fill", parent.id, cameras)
+    callback_url = jobs.callbacks.check(form.get("callback_url"))
+    return _add_edit(edit, upload_folder, jobs, parent, callback_url)
 
 
 def accept_removal(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: Job) -> Job:
@@ -159,7 +163,9 @@ def accept_removal(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: J
         sent_mask(upload_folder / MASK_FILE, camera_from_json(camera, "camera"))
     except InputError as error:
         raise HTTPException(415, str(error)) from error
-    return _add_edit(Edit("remove", parent.id, [camera], MASK_FILE), upload_folder, jobs, parent)
+    edit = Edit("remove", parent.id, [camera], MASK_FILE)
+    callback_url = jobs.callbacks.check(form.get("callback_url"))
+    return _add_edit(edit, upload_folder, jobs, parent, callback_url)
 
 
 def _edit_options(form: FormData, model: type[MODEL]) -> MODEL:
@@ -186,7 +192,9 @@ def _check_view(camera: dict[str, Any], where: str) -> None:
         raise HTTPException(422, f"options: {where}: {problem}: at most {limit}")
 
 
-def _add_edit(edit: Edit, upload_folder: Path, jobs: Jobs, parent: Job) -> Job:
+def _add_edit(
+    edit: Edit, upload_folder: Path, jobs: Jobs, parent: Job, callback_url: str | None
+) -> Job:
     """Queue an edit of a scene, with files of its own; returns its job.
 
     HTTPException 409 if the scene has been deleted meanwhile.
@@ -206,6 +214,7 @@ def _add_edit(edit: Edit, upload_folder: Path, jobs: Jobs, parent: Job) -> Job:
         # are made when somebody asks for them.
         options={**parent.options, "files": []},
         edit=edit,
+        callback_url=callback_url,
     )
 
 
