@@ -37,6 +37,8 @@ from spackle.residual.architectures import (
     shipped_network,
 )
 from spackle.residual.network import ResidualNet
+from spackle.runtime.declared_options import FillMode as FillMode
+from spackle.runtime.declared_options import FillTexture as FillTexture
 from spackle.runtime.errors import InputError, check_name
 from spackle.runtime.plugins import check_name_or_plugin, is_plugin
 from spackle.runtime.progress import (
@@ -55,14 +57,7 @@ from spackle.scene_fill.texture import Texture, exemplar_texture, painted_textur
 from spackle.views import GivenPath, PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed_weights
 
-# The built-in sources of the texture in the holes; see `open_texture`.
-FillTexture = Literal["auto", "network", "exemplar", "lama", "none"]
 FILL_TEXTURES: tuple[str, ...] = get_args(FillTexture)
-# One set of aux Gaussians for all views; one set for each view; or one set for each view by the
-# paper's method alone, without what Spackle adds to it.
-FillMode = Literal["scene", "view", "paper"]
-
-
 # Given views stand anywhere, so that many of them must protect what they show.
 MAX_GUARDED_VIEWS = 32
 

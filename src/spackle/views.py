@@ -34,12 +34,12 @@ from spackle.formats.camera_set import CameraSet
 from spackle.formats.scene_content import SceneFile, is_at_origin
 from spackle.render.protocol import Renderer
 from spackle.residual.features import hole_area_ratio
+from spackle.runtime.declared_options import MAX_FRAME_COUNT as MAX_FRAME_COUNT
 from spackle.runtime.errors import InputError, as_input_error, check_name
 from spackle.video.frames import SAME_ASPECT_TOLERANCE, FrameMaker
 from spackle.video.options import VideoOptions
 
 DEFAULT_FRAME_COUNT = 60  # cameras of `Scene.path`; of a longer path, 60 to 119 frames are filled
-MAX_FRAME_COUNT = 10_000  # of a video
 DEFAULT_VIDEO_SECONDS = 4.0  # duration of a video along a trajectory
 MAX_OVERSCAN = 0.5  # focal length times 1.5, which leaves 44 % of the photo's area
 MAX_REPORTED_KEYFRAMES = 16  # the report measures the holes of at most so many keyframes

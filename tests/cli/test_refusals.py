@@ -60,7 +60,10 @@ PREDICT = [
     ("--depth-out a/depth.npy", "--depth-out a/depth.npy"),
     ("--base sharp9", "--base"),
     ("--device cuda", "--device"),
-    ("--device cuda:x", "--device cuda:x: give auto, cpu, cuda, or one GPU such as cuda:1"),
+    (
+        "--device cuda:x",
+        "--device cuda:x is unknown: did you mean cuda:N? There are auto, cpu, cuda,",
+    ),
     ("-c weights.pt", "-c"),
     ("--cameras sizes.json", "--no-render"),
     *(

@@ -16,10 +16,10 @@ from spackle.cli.options import (
     DeviceOption,
     PrecisionOption,
     RayOption,
-    SharpTrajectoryName,
     VerboseOption,
     WorkersOption,
 )
+from spackle.runtime.declared_options import SharpTrajectory
 
 dataset = typer.Typer(
     help="Build and inspect training data: views with holes, and targets.", no_args_is_help=True
@@ -88,7 +88,7 @@ def dataset_build(
         ),
     ] = 20,
     trajectory: Annotated[
-        SharpTrajectoryName | None,
+        SharpTrajectory | None,
         typer.Option(help="Camera path; default: a random path for each photo."),
     ] = None,
     disparity: Annotated[

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from spackle.cli.options import DeviceOption, JsonOption, TrajectoryName
+from spackle.cli.options import DeviceOption, JsonOption
+from spackle.runtime.declared_options import TrajectoryKind
 
 
 def fill(
@@ -35,7 +36,7 @@ def fill(
         ),
     ] = None,
     trajectory: Annotated[
-        TrajectoryName | None,
+        TrajectoryKind | None,
         typer.Option(help="The path around one camera.", show_default="rotate-forward"),
     ] = None,
     disparity: Annotated[

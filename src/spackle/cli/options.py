@@ -1,5 +1,6 @@
-"""Options that several commands have, each declared once as an annotated type.
+"""Options that several commands have, each once as an annotated type.
 
+`declared` makes them of `runtime/declared_options.py`, which Python and HTTP use, too.
 `path_options` collects those of camera path and video, which `predict` and `render` share.
 """
 
@@ -8,12 +9,23 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from typer.core import TyperOption
 
-from spackle.runtime.errors import InputError
+from spackle.runtime.declared_options import (
+    DECLARATIONS,
+    DepthKind,
+    DeviceName,
+    Fit,
+    Precision,
+    Show,
+    StereoLayout,
+    TrajectoryKind,
+    VideoFormatName,
+)
+from spackle.runtime.errors import InputError, unknown_name
 
 if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.views import PathOptions
@@ -21,12 +33,6 @@ if TYPE_CHECKING:  # torch takes seconds to load
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells report it
 PAPER_PANEL = "The paper's experiments"  # where help lists the commands that repeat them
 
-# Names of the library's registries, which cannot be imported here, because help must not wait for
-# torch. A test compares them.
-SharpTrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
-TrajectoryName = Literal[SharpTrajectoryName, "vertical", "orbit", "dolly-zoom"]
-PrecisionName = Literal["auto", "fp32", "bf16"]
-DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 DATASET_BASES = "sharp, moge, lite, hf:NAME, package.module:Class, or rgbd with depth maps"
 INPAINTERS = "exemplar, lama, opencv, propainter, or package.module:Class"
 DATASETS = "middlebury, booster, wildrgbd, tanks, eth3d, llff, pairs (your own), or photos alone"
@@ -36,8 +42,42 @@ WEIGHTS = "depth (MoGe-2), sharp, lama, features or squeezenet"
 
 DEVICE_NAME = re.compile(r"auto|cpu|cuda(:(?P<number>[0-9]{1,3}))?")
 
+
+def declared(
+    name: str, *flags: str, unset: str | None = None, more_help: str = "", **look: Any
+) -> Any:
+    """The typer option of a declared option: its help, with other options named as flags.
+
+    Args:
+        name: Python name of the option, one of `DeclaredOptions`.
+        flags: how the user writes it, if not as its name.
+        unset: what holds without the option, if not what is declared.
+        more_help: what only a command can do.
+        **look: further arguments of `typer.Option`, such as `metavar` and `hidden`.
+    """
+    declaration = DECLARATIONS[name]
+    default_text = declaration.unset if unset is None else unset
+    return typer.Option(
+        *flags,
+        help=_with_flags(declaration.help) + more_help,
+        show_default=_with_flags(default_text) or True,
+        **look,
+    )
+
+
+def _with_flags(text: str) -> str:
+    """The text, with every declared option in backticks replaced by its flag."""
+
+    def flag_of(match: re.Match[str]) -> str:
+        """The flag of the name in backticks; the text as it is for any other word."""
+        is_option = match[1] in DECLARATIONS or match[1] == "depth"  # the depth is an input file
+        return "--" + match[1].replace("_", "-") if is_option else match[0]
+
+    return re.sub(r"`([a-z_]+)`", flag_of, text)
+
+
 # The machine.
-PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]
+PrecisionOption = Annotated[Precision, typer.Option(help="Precision of the base's network.")]
 
 
 def use_gpu_alone(name: str) -> str:
@@ -48,7 +88,9 @@ def use_gpu_alone(name: str) -> str:
     """
     match = DEVICE_NAME.fullmatch(name)
     if match is None:
-        raise InputError(f"--device {name}: give auto, cpu, cuda, or one GPU such as cuda:1")
+        raise InputError(
+            f"--device {name} is {unknown_name(name, [*get_args(DeviceName), 'cuda:N'])}"
+        )
     if match["number"] is None:
         return name
     # The number counts the GPUs that the user has made visible, as torch counts them.
@@ -61,10 +103,11 @@ def use_gpu_alone(name: str) -> str:
 
 DeviceOption = Annotated[
     str,
-    typer.Option(
+    declared(
+        "device",
+        more_help=" cuda:1: the second GPU.",
         metavar="auto|cpu|cuda|cuda:N",
         callback=use_gpu_alone,
-        help="Device of networks and renderer; cuda:1: the second GPU.",
     ),
 ]
 # Several processes, on this machine or on a cluster.
@@ -97,13 +140,7 @@ RayOption = Annotated[
     ),
 ]
 SharpWindowsOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        hidden=True,
-        help="SHARP computes N of its 35 windows at once (default 5, on a GPU all); "
-        "1 takes least memory.",
-    ),
+    int | None, declared("windows_per_batch", "--sharp-windows", metavar="N", hidden=True)
 ]
 
 # Output.
@@ -116,40 +153,12 @@ VerboseOption = Annotated[
 
 # The photo and its base.
 CheckpointOption = Annotated[
-    Path | None,
-    typer.Option(
-        "-c",
-        "--checkpoint",
-        metavar="FILE",
-        help="Weights of the base: of sharp, moge or lite; with auto of sharp.",
-    ),
+    Path | None, declared("checkpoint", "-c", "--checkpoint", metavar="FILE")
 ]
-FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
-KeepFrameOption = Annotated[
-    bool,
-    typer.Option(
-        "--keep-frame", help="Keep a scan's margin or letterbox bars, which are cropped by default."
-    ),
-]
-DepthKindOption = Annotated[
-    DepthKindName,
-    typer.Option(
-        hidden=True,
-        help="What the numbers in --depth mean. metric: metres, or millimetres in a 16-bit PNG; "
-        "disparity: pixels of a calibrated pair; near-white: relative depth, near is bright, as "
-        "MiDaS, Depth Anything and ComfyUI write it; near-black: relative depth, near is dark. "
-        "auto: disparity if there is a calibration, else metric.",
-    ),
-]
-DepthUnitOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="UNIT",
-        help="Unit of --depth: m, cm, mm, km, or a number of metres, such as 1/256 for KITTI; "
-        "1/m: inverse depth.",
-        show_default="mm in a PNG or TIFF of 16 bits, else m",
-    ),
-]
+FovOption = Annotated[float | None, declared("fov")]
+KeepFrameOption = Annotated[bool, declared("keep_frame", "--keep-frame")]
+DepthKindOption = Annotated[DepthKind, declared("depth_kind", hidden=True)]
+DepthUnitOption = Annotated[str | None, declared("depth_unit", metavar="UNIT")]
 
 # The server.
 HostOption = Annotated[
@@ -164,117 +173,33 @@ PortOption = Annotated[
 ]
 
 # The camera path.
+# None as default, because the command must see whether the user has given the option.
 TrajectoryOption = Annotated[
-    TrajectoryName | None,
-    typer.Option(help="Camera path of the video.", show_default="rotate-forward"),
+    TrajectoryKind | None, declared("trajectory", unset=DECLARATIONS["trajectory"].default)
 ]
 DisparityOption = Annotated[
     float | None,
-    typer.Option(
-        help="How far the camera moves to the side, as a disparity from 0 to 2; 0.3 is large.",
-        show_default="the saved scene's; predict: chosen for the photo, at most 0.15 with lite, "
-        "else 0.3",
+    declared(
+        "disparity",
+        unset="the saved scene's; predict: chosen for the photo, at most 0.15 with lite, else 0.3",
     ),
 ]
-PathFileOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--path",
-        metavar="FILE",
-        hidden=True,
-        help="Keyframes of a path, see docs/video.md; or cameras as those of --cameras.",
-    ),
-]
-CamerasOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        hidden=True,
-        help="Complete the views in a file instead of a path: Spackle's, transforms.json of "
-        "nerfstudio, cameras.json of 3DGS, a COLMAP folder and others, see docs/inputs.md.",
-    ),
-]
-FramesOption = Annotated[
-    int | None, typer.Option(hidden=True, help="Number of frames, instead of --seconds.")
-]
-SecondsOption = Annotated[
-    float | None,
-    typer.Option(
-        help="Length of the video in seconds.", show_default="4, or the duration of --path"
-    ),
-]
-OverscanOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SHARE",
-        hidden=True,
-        help="Increase the focal length by this fraction, which hides most of the area beyond the "
-        "photo's border.",
-        show_default="0.05; 0 with --path and --cameras",
-    ),
-]
+PathFileOption = Annotated[Path | None, declared("path", "--path", metavar="FILE", hidden=True)]
+CamerasOption = Annotated[Path | None, declared("cameras", metavar="FILE", hidden=True)]
+FramesOption = Annotated[int | None, declared("frames", hidden=True)]
+SecondsOption = Annotated[float | None, declared("seconds")]
+OverscanOption = Annotated[float | None, declared("overscan", metavar="SHARE", hidden=True)]
 
 # The video.
-VideoFormatOption = Annotated[
-    Literal["mp4", "webm", "gif", "webp"] | None,
-    typer.Option("--format", help="Video format.", show_default="mp4"),
-]
-FpsOption = Annotated[
-    float | None, typer.Option(help="Frames a second.", show_default="30", hidden=True)
-]
-LoopOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        hidden=True,
-        help="Show the video N times; 0: for ever.",
-        show_default="0 for gif and webp, else 1",
-    ),
-]
-SizeOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="WxH",
-        help="Size of the video (of one eye's view): 1280x720, or 16:9, 9:16 or 1:1.",
-    ),
-]
-FitOption = Annotated[
-    Literal["pad", "blur", "crop"],
-    typer.Option(
-        hidden=True,
-        help="How to reach the aspect ratio of --size: black or blurred margins, or cropping.",
-    ),
-]
-ShowOption = Annotated[
-    Literal["color", "depth"],
-    typer.Option(
-        hidden=True, help="Show the scene's colours, or its depth as colours (near is bright)."
-    ),
-]
-StereoOption = Annotated[
-    Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"] | None,
-    typer.Option(
-        hidden=True, help="Stereo video: side by side, over-under, or for red-cyan glasses."
-    ),
-]
-IpdOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="METRES",
-        hidden=True,
-        help="Distance of the eyes.",
-        show_default="by the scene's depth",
-    ),
-]
-ConvergenceOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="METRES",
-        hidden=True,
-        help="Depth that appears in the plane of the screen.",
-        show_default="depth of the point that the camera looks at",
-    ),
-]
+VideoFormatOption = Annotated[VideoFormatName | None, declared("format", "--format")]
+FpsOption = Annotated[float | None, declared("fps", hidden=True)]
+LoopOption = Annotated[int | None, declared("loop", metavar="N", hidden=True)]
+SizeOption = Annotated[str | None, declared("size", metavar="WxH")]
+FitOption = Annotated[Fit, declared("fit", hidden=True)]
+ShowOption = Annotated[Show, declared("show", hidden=True)]
+StereoOption = Annotated[StereoLayout | None, declared("stereo", hidden=True)]
+IpdOption = Annotated[float | None, declared("ipd", metavar="METRES", hidden=True)]
+ConvergenceOption = Annotated[float | None, declared("convergence", metavar="METRES", hidden=True)]
 
 
 def _print_full_help(context: typer.Context, asked: bool) -> None:
@@ -305,20 +230,20 @@ HelpAllOption = Annotated[
 
 def path_options(
     *,
-    trajectory: TrajectoryName | None,
+    trajectory: TrajectoryKind | None,
     disparity: float | None,
     path: Path | None,
     cameras: Path | None,
     frames: int | None,
     seconds: float | None,
-    video_format: Literal["mp4", "webm", "gif", "webp"] | None,
+    video_format: VideoFormatName | None,
     fps: float | None,
     loop: int | None,
     overscan: float | None,
     size: str | None,
-    fit: Literal["pad", "blur", "crop"],
-    show: Literal["color", "depth"],
-    stereo: Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"] | None,
+    fit: Fit,
+    show: Show,
+    stereo: StereoLayout | None,
     ipd: float | None,
     convergence: float | None,
     compare: bool = False,

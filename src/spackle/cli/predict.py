@@ -6,7 +6,7 @@ Options for few users are hidden; --help-all shows them.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -29,7 +29,6 @@ from spackle.cli.options import (
     LoopOption,
     OverscanOption,
     PathFileOption,
-    PrecisionName,
     RayOption,
     SecondsOption,
     SharpWindowsOption,
@@ -41,8 +40,10 @@ from spackle.cli.options import (
     VerboseOption,
     VideoFormatOption,
     WorkersOption,
+    declared,
     path_options,
 )
+from spackle.runtime.declared_options import FillMode, Precision
 from spackle.runtime.errors import InputError
 
 if TYPE_CHECKING:  # torch takes seconds to load
@@ -69,18 +70,7 @@ def predict(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
     ] = Path("out"),
-    base: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Base, which turns the photo into Gaussians. rgbd: a depth map; sharp: Apple's "
-            "network; moge: MoGe-2, with metric depth and focal length; lite: small networks "
-            "inside Spackle, with rough depth; hf:OWNER/NAME or hf:FOLDER: a depth model of "
-            "transformers; package.module:Class: a base of another package. auto: the given depth "
-            "map, or the one in the photo's file, else sharp or moge if their weights are "
-            "downloaded, else lite.",
-        ),
-    ] = "auto",
+    base: Annotated[str, declared("base", metavar="NAME")] = "auto",
     depth: Annotated[
         Path | None,
         typer.Option(
@@ -91,66 +81,19 @@ def predict(
     ] = None,
     depth_kind: DepthKindOption = "auto",
     depth_unit: DepthUnitOption = None,
-    near: Annotated[
-        float | None,
-        typer.Option(
-            hidden=True,
-            metavar="METRES",
-            help="Distance in metres of the nearest part of a relative --depth.",
-            show_default="1.5",
-        ),
-    ] = None,
-    far: Annotated[
-        float | None,
-        typer.Option(
-            hidden=True,
-            metavar="METRES",
-            help="Distance in metres of the farthest part of a relative --depth.",
-            show_default="15",
-        ),
-    ] = None,
-    calib: Annotated[
-        Path | None,
-        typer.Option(
-            hidden=True, metavar="FILE", help="calib.txt, if it is not in the map's folder."
-        ),
-    ] = None,
+    near: Annotated[float | None, declared("near", metavar="METRES", hidden=True)] = None,
+    far: Annotated[float | None, declared("far", metavar="METRES", hidden=True)] = None,
+    calib: Annotated[Path | None, declared("calib", metavar="FILE", hidden=True)] = None,
     checkpoint: CheckpointOption = None,
-    precision: Annotated[
-        PrecisionName,
-        RayOption,
-        typer.Option(
-            hidden=True,
-            help="Precision of the base's network; auto: bf16 if the hardware supports it.",
-        ),
-    ] = "auto",
+    precision: Annotated[Precision, declared("precision", hidden=True)] = "auto",
     sharp_windows: SharpWindowsOption = None,
     residual: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATH|initial|none",
-            hidden=True,
-            help="Weights of the residual. initial: no network; none: no fill. Default: the "
-            "weights in the package.",
-        ),
+        str | None, declared("residual", metavar="PATH|initial|none", hidden=True)
     ] = None,
     residual_network: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MODULE:CLASS",
-            hidden=True,
-            help="The network of --residual, if another package defines it.",
-        ),
+        str | None, declared("residual_network", metavar="MODULE:CLASS", hidden=True)
     ] = None,
-    fill: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Texture in the holes. lama: LaMa (`spackle weights get lama`); exemplar: patches "
-            "of the photo; network: no texture; none: no fill; package.module:Class: an inpainter "
-            "of another package; auto: lama if its weights are downloaded, else exemplar.",
-        ),
-    ] = "auto",
+    fill: Annotated[str, declared("fill", metavar="NAME")] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
     keep_base: Annotated[
         bool,
@@ -182,22 +125,10 @@ def predict(
     stereo: StereoOption = None,
     ipd: IpdOption = None,
     convergence: ConvergenceOption = None,
-    mode: Annotated[
-        Literal["scene", "view", "paper"],
-        typer.Option(
-            hidden=True,
-            help="scene: one set of aux Gaussians for all views; view: a set for each view; "
-            "paper: a set for each view by the paper's method alone (eqs. 2 to 9): one pass, no "
-            "occlusion guard, no texture.",
-        ),
-    ] = "scene",
+    mode: Annotated[FillMode, declared("mode", hidden=True)] = "scene",
     device: DeviceOption = "auto",
-    focal_px: Annotated[
-        float | None, typer.Option(hidden=True, help="Focal length in pixels of the photo.")
-    ] = None,
-    focal_mm: Annotated[
-        float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")
-    ] = None,
+    focal_px: Annotated[float | None, declared("focal_px", hidden=True)] = None,
+    focal_mm: Annotated[float | None, declared("focal_mm")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
     overwrite: Annotated[

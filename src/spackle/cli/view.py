@@ -20,6 +20,7 @@ from spackle.cli.options import (
     KeepFrameOption,
     PortOption,
     VerboseOption,
+    declared,
 )
 
 TOKEN_BYTES = 16  # of the secret in the page's address
@@ -40,14 +41,8 @@ def view(
     depth_kind: DepthKindOption = "auto",
     depth_unit: DepthUnitOption = None,
     checkpoint: CheckpointOption = None,
-    disparity: Annotated[
-        float | None,
-        typer.Option(
-            help="How far the camera moves to the side, as a disparity from 0 to 2; 0.3 is large.",
-            show_default="chosen for each photo, at most 0.15 with lite, else 0.3",
-        ),
-    ] = None,
-    focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels.")] = None,
+    disparity: Annotated[float | None, declared("disparity")] = None,
+    focal_px: Annotated[float | None, declared("focal_px")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
     device: DeviceOption = "auto",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -16,9 +16,10 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.runtime.declared_options import MAX_DISPARITY as MAX_DISPARITY
+from spackle.runtime.declared_options import SharpTrajectory as SharpTrajectory
+from spackle.runtime.declared_options import TrajectoryKind as TrajectoryKind
 
-SharpTrajectory = Literal["swipe", "shake", "rotate", "rotate-forward"]
-TrajectoryKind = Literal[SharpTrajectory, "vertical", "orbit", "dolly-zoom"]
 # SHARP's trajectories, which the paper uses for data and training.
 SHARP_TRAJECTORIES: tuple[SharpTrajectory, ...] = get_args(SharpTrajectory)
 TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
@@ -27,7 +28,6 @@ NEAR_QUANTILE = 0.001  # quantile of depth that defines z_near
 FOCUS_QUANTILE = 0.1  # quantile of depth that defines the focus depth
 # SHARP's rule for scenes in metres: a nearer focus would turn the camera too much.
 MIN_FOCUS_M = 2.0
-MAX_DISPARITY = 2.0  # beyond, the photo is out of view
 # Relative gain in focal length along a path; hides most of the fill beyond the photo's border.
 DEFAULT_OVERSCAN = 0.05
 FORWARD_MOTION_RATIO = 0.15  # forward motion of rotate-forward, in units of z_near

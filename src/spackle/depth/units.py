@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -21,11 +21,11 @@ from spackle.depth.depth_map import (
     check_not_negative,
     quantisation_step,
 )
+from spackle.runtime.declared_options import DepthKind as DepthKind
 from spackle.runtime.errors import InputError, short_repr
 
 # What the numbers of a file mean. "near-white" is inverse depth and "near-black" is depth, both up
 # to scale and shift; "auto" decides between metric depth and disparity.
-DepthKind = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 DEPTH_KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
 RELATIVE_KINDS: tuple[DepthKind, ...] = ("near-white", "near-black")
 

@@ -9,6 +9,7 @@ camera sees. `screen_blend.py` blends ellipses that are given in the image.
 """
 
 import logging
+from typing import get_args
 
 import torch
 
@@ -16,6 +17,7 @@ from spackle.render.cpu import CpuRenderer
 from spackle.render.drawing import touched_tiles
 from spackle.render.gsplat_backend import GsplatRenderer
 from spackle.render.protocol import TILE_PX, Renderer
+from spackle.runtime.declared_options import DeviceName
 from spackle.runtime.errors import InputError, check_name
 
 __all__ = ["TILE_PX", "CpuRenderer", "Renderer", "get_renderer", "touched_tiles"]
@@ -31,7 +33,7 @@ def get_renderer(device: str = "auto") -> Renderer:
     Raises:
         InputError: the device is unknown, or "cuda" cannot render on this machine.
     """
-    check_name("device", device, ("auto", "cpu", "cuda"))
+    check_name("device", device, get_args(DeviceName))
 
     if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         try:

@@ -12,11 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 
 import spackle  # for the version, which is written in this one place; it loads nothing else
+from spackle.runtime.declared_options import Precision as Precision
 from spackle.runtime.errors import InputError, check_name
 
 # Torch reports a shortage of memory also by plain RuntimeErrors, whose messages contain one of
@@ -120,7 +121,6 @@ def without_autocast_or_tf32(device: torch.device) -> Iterator[None]:
                 switch.fp32_precision = precision
 
 
-Precision = Literal["auto", "fp32", "bf16"]
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 

@@ -5,18 +5,14 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import cast, get_args
 
+from spackle.runtime.declared_options import Fit as Fit
+from spackle.runtime.declared_options import Show as Show
+from spackle.runtime.declared_options import StereoLayout as StereoLayout
+from spackle.runtime.declared_options import VideoFormatName as VideoFormatName
 from spackle.runtime.errors import InputError, check_name
 from spackle.video.video_formats import DEFAULT_FPS, VIDEO_FORMATS, check_fps, check_loop
-
-VideoFormatName = Literal["mp4", "webm", "gif", "webp"]
-# For a view of another aspect ratio than the video's: black margins, blurred margins, or cropping.
-Fit = Literal["pad", "blur", "crop"]
-# Colours, or the depth as colours.
-Show = Literal["color", "depth"]
-# Two eyes side by side (sbs), one over the other (ou), or mixed for red-cyan glasses.
-StereoLayout = Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"]
 
 # Names for a video's width and height in pixels.
 SIZE_PRESETS = {"16:9": (1920, 1080), "9:16": (1080, 1920), "1:1": (1080, 1080)}

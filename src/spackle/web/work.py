@@ -19,7 +19,7 @@ from spackle.core.color import to_uint8
 from spackle.core.image_files import OpenPicture, read_picture
 from spackle.core.photo import check_photo_size, refuse_if_not_flat
 from spackle.core.srgb_pictures import picture_to_srgb
-from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
+from spackle.core.trajectories import TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import DepthKind
 from spackle.formats.camera_files import camera_from_json
 from spackle.formats.html import PageScene, html_safe_json
@@ -27,13 +27,14 @@ from spackle.formats.scene_files import load_scene, scene_suffix
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import get_renderer
 from spackle.results.photo_folder import REPORT_NAME, PhotoOptions, predict_photo
+from spackle.runtime.declared_options import DECLARATIONS
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic, write_json
 from spackle.runtime.progress import Reporter, StageProgress
 from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
 from spackle.video.video_formats import DEFAULT_FPS
-from spackle.views import DEFAULT_VIDEO_SECONDS, MAX_FRAME_COUNT, PathOptions
+from spackle.views import DEFAULT_VIDEO_SECONDS, PathOptions
 from spackle.web.edits import (
     FORMER_PAGE,
     REMOVED_FILE,
@@ -77,37 +78,50 @@ PREVIEW = "photo.jpg"  # the small photo that the page shows until the scene is 
 PREVIEW_SIDE_PX = 1280  # pixels of the preview's long side
 
 
+def declared_field(name: str, **changes: Any) -> Any:
+    """The field of a declared option in the HTTP interface: its default, limits and help.
+
+    Args:
+        name: Python name of the option, one of `DeclaredOptions`.
+        **changes: arguments of pydantic's `Field` that go before what is declared.
+    """
+    declaration = DECLARATIONS[name]
+    description = declaration.help
+    if declaration.unset:
+        description += f" null: {declaration.unset}."
+    declared: dict[str, Any] = {
+        "default": declaration.default,
+        "description": description,
+        **declaration.limits,
+    }
+    return Field(**{**declared, **changes})
+
+
 class SceneOptions(BaseModel):
     """Options that a client can set for a scene."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    base: str | None = Field(
-        None, max_length=80, description="One of the server's bases; null: its default."
+    base: str | None = declared_field(
+        "base",
+        default=None,
+        max_length=80,
+        description="One of the server's bases; null: its default.",
     )
-    depth_kind: DepthKind = Field("auto", description="What the numbers in the depth map mean.")
-    depth_unit: str | None = Field(
-        None,
-        max_length=40,
-        description="Unit of metric depth, such as m, mm or 1/256; null: mm in a PNG, else m.",
-    )
-    disparity: float | None = Field(
-        None, ge=0, le=MAX_DISPARITY, description="How far the camera moves; 0.3 is large."
-    )
-    trajectory: TrajectoryKind = Field("rotate-forward", description="Camera path of the video.")
-    frames: int = Field(
-        round(DEFAULT_VIDEO_SECONDS * DEFAULT_FPS),
-        ge=1,
-        le=MAX_FRAME_COUNT,
+    depth_kind: DepthKind = declared_field("depth_kind")
+    depth_unit: str | None = declared_field("depth_unit", max_length=40)
+    disparity: float | None = declared_field("disparity")
+    trajectory: TrajectoryKind = declared_field("trajectory")
+    frames: int = declared_field(
+        "frames",
+        default=round(DEFAULT_VIDEO_SECONDS * DEFAULT_FPS),
         description="Number of frames of the video, 30 per second.",
     )
-    fill: FillTexture = Field("auto", description="Source of the texture in the holes.")
-    focal_px: float | None = Field(None, gt=0, description="Focal length in pixels of the photo.")
-    focal_mm: float | None = Field(None, gt=0, description="Focal length in mm, 35 mm equivalent.")
-    fov: float | None = Field(
-        None, gt=0, lt=180, description="Horizontal field of view in degrees."
-    )
-    keep_frame: bool = Field(False, description="Keep a uniform frame around the picture.")
+    fill: FillTexture = declared_field("fill")
+    focal_px: float | None = declared_field("focal_px")
+    focal_mm: float | None = declared_field("focal_mm")
+    fov: float | None = declared_field("fov")
+    keep_frame: bool = declared_field("keep_frame")
     files: list[FileName] = Field(
         DEFAULT_FILES, description="Files to make before the job is done."
     )
