@@ -21,6 +21,7 @@ $(VENV)/.installed: $(VENV)/.demo
 	touch $@
 
 demo: $(VENV)/.demo
+	-$(BIN)/spackle weights get squeezenet  # 0.7 MB, for the second column of the table
 	$(BIN)/spackle demo --output demo-output
 
 test: $(VENV)/.installed

@@ -53,6 +53,9 @@ def test_the_demo_fills_the_hole_better_than_2d_inpainting(
         SIZE[0] + 1,
         SIZE[1],
     )  # made even
+    # The perceptual distance needs weights; without them the command says how to get them.
+    assert report["right_camera"]["distance"] == {}
+    assert "`spackle weights get squeezenet`" in result.err
     psnr = report["right_camera"]["psnr"]
     hole = {name: score["in_hole"] for name, score in psnr.items()}
     assert max(hole[INPAINTING], hole["base"]) + 0.5 < min(hole[SPACKLE], hole[TRAINED])

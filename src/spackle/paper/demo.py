@@ -17,7 +17,8 @@ from spackle.core.photo import Photo
 from spackle.formats import save_ply, save_png
 from spackle.formats.png import contact_sheet
 from spackle.paper.evaluation.datasets.stereo import StereoPair, load_motorcycle
-from spackle.paper.training.losses import hole_psnr
+from spackle.paper.training.feature_networks import load_features
+from spackle.paper.training.losses import hole_distance, hole_psnr
 from spackle.pipeline import CompletedPhoto, Pipeline, PipelineOptions, complete
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
@@ -26,6 +27,7 @@ from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.views import PathOptions
+from spackle.weights import installed_weights
 
 RESULT_FILES = (
     "base.ply",
@@ -96,6 +98,7 @@ def run_demo(output: Path, reporter: Reporter) -> None:
         write_json(report, output / "report.json")
 
         reporter.console.print(_table(scores))
+        reporter.log(_explanation(scores))
         reporter.log(
             f"{len(scene.aux):,} aux Gaussians; holes at disparity ±{DISPARITY:g}: "
             f"{hole_ratio_before:.1%} -> {hole_ratio_after:.2%}; {total_seconds:.0f} s"
@@ -132,8 +135,10 @@ def _compare_truth(
     photo are written to `output`, as right_view.png and right_photo.png.
 
     Returns:
-        "har_before" and "har_after", the view's share of holes before and after completion; and
-        "psnr", by the name of each way: the PSNR in dB "in_hole" and "outside" of the base's holes.
+        "har_before" and "har_after", the view's share of holes before and after completion;
+        "psnr", by the name of each way: the PSNR in dB "in_hole" and "outside" of the base's holes;
+        and "distance" by the same names: the distance of SqueezeNet's features in the holes, empty
+        if its weights are not on this machine.
     """
     # Imported here, because scikit-image is an optional package.
     from skimage.restoration import inpaint_biharmonic
@@ -165,22 +170,52 @@ def _compare_truth(
         }
         for name, picture in pictures.items()
     }
+    # PSNR compares pixels, this distance what a network for pictures sees in them.
+    distance: dict[str, float] = {}
+    features_file = installed_weights("squeezenet")
+    if features_file is not None:
+        features = load_features("squeezenet", features_file)
+        assert features is not None  # a network is named
+        distance = {
+            name: hole_distance(features, picture, pair.right, hole)
+            for name, picture in pictures.items()
+        }
     return {
         "har_before": hole_area_ratio(base_view.alpha),
         "har_after": hole_area_ratio(trained_view.alpha),
         "psnr": psnr,
+        "distance": distance,
     }
 
 
 def _table(scores: dict[str, Any]) -> Table:
     """The result of `_compare_truth`, the comparison with the true right photo, as a table.
 
-    It has a row for each way to draw the view, and the PSNR in dB in two columns.
+    It has a row for each way to draw the view, the distance in the hole if it was measured, and the
+    PSNR in dB in two columns.
     """
+    distance = scores["distance"]
     holes = f"{scores['har_before']:.1%} holes before, {scores['har_after']:.2%} after"
     table = Table(title=f"True right camera: {holes}")
-    for header in ("PSNR against the true photo", "in the hole", "outside"):
-        table.add_column(header)
+    table.add_column("against the true photo")
+    if distance:
+        table.add_column("distance in the hole ↓")
+    table.add_column("PSNR in the hole ↑")
+    table.add_column("PSNR outside ↑")
     for name, psnr in scores["psnr"].items():
-        table.add_row(name, f"{psnr['in_hole']:.2f} dB", f"{psnr['outside']:.2f} dB")
+        distances = [f"{distance[name]:.3f}"] if distance else []
+        table.add_row(name, *distances, f"{psnr['in_hole']:.2f} dB", f"{psnr['outside']:.2f} dB")
     return table
+
+
+def _explanation(scores: dict[str, Any]) -> str:
+    """A line below the table: what the two measures reward, or how to get the second one."""
+    if not scores["distance"]:
+        return (
+            "The network shows in the perceptual distance, which needs `spackle weights get "
+            "squeezenet` (0.7 MB): PSNR rewards smooth colours."
+        )
+    return (
+        "PSNR rewards smooth colours, as of the initial Gaussians; the distance, by a network's "
+        "features, rewards structure as in the true photo, which the trained weights add."
+    )
