@@ -4,6 +4,7 @@ import { cameraAt, Edits } from "./edits.js";
 import { gift, title } from "./gift.js";
 import { divider, fit, panel, roomy, unfold } from "./panel.js";
 import { Queue } from "./queue.js";
+import { sharing } from "./share.js";
 import * as source from "./source.js";
 import { KINDS, Viewer } from "./viewer.js";
 import { eyeOnPath, lookingAxes } from "./views.js";
@@ -27,6 +28,7 @@ if (viewer) {
   control(viewer.canvas, viewer);
   panel(viewer, say);
   divider(viewer);
+  sharing(viewer, say);
   queue = new Queue(element("queue"), { work, ended, pick, stop, shows, resized: () => fit(viewer) });
   edits = new Edits(viewer, { say, progress, begin: (id) => (editing = id), end, swapped });
   uploads();

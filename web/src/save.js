@@ -63,11 +63,11 @@ function oneTurn(viewer, onProgress) {
   });
 }
 
-function fileName({ description }) {
+export function fileName({ description }) {
   return description.name.replace(/\.[^.]*$/, "").replace(/[^\p{L}\p{N}._-]+/gu, "-") || "scene";
 }
 
-function download(blob, name) {
+export function download(blob, name) {
   const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);

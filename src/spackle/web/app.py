@@ -44,6 +44,7 @@ from spackle.web.description import (
 )
 from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, Access, Guard
 from spackle.web.jobs import Job, Jobs, RetentionLimits, SceneState
+from spackle.web.shared_videos import SharedVideo
 from spackle.web.uploads import (
     FILL_FORM,
     FORM_MODELS,
@@ -67,7 +68,7 @@ PagePart = Literal[
     "photo.jpg",
 ]
 # The files that a state lists if they exist.
-LISTED_FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video)])
+LISTED_FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video), *get_args(SharedVideo)])
 POLL_S = 0.1  # seconds between two checks whether a state has changed
 MAX_UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
 MAX_CONNECTIONS = 512  # open at a time; further ones are refused

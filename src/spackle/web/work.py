@@ -43,6 +43,7 @@ from spackle.web.edits import (
     sent_mask,
 )
 from spackle.web.jobs import Job
+from spackle.web.shared_videos import SharedVideo, shared_video_options
 
 Download = Literal[
     "scene.ply",
@@ -63,7 +64,7 @@ Video = Literal[
     "orbit.mp4",
     "dolly-zoom.mp4",
 ]
-FileName = Literal[Download, Video]  # one list, so that a refusal names all
+FileName = Literal[Download, Video, SharedVideo]  # one list, so that a refusal names all
 DEFAULT_FILES: list[FileName] = [
     "scene.ply",
     "scene.spz",
@@ -294,7 +295,13 @@ class SceneWork:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.name == REMOVED_FILE:
             raise InputError(f"{job.name}: nothing was removed from this scene")
-        if target.suffix == ".mp4":
+        shared = shared_video_options(target.name, scene.camera)
+        if shared is not None:
+            renderer = get_renderer(self.base.device)
+            scene.save_video(
+                target, options.trajectory, renderer=renderer, **dataclasses.asdict(shared)
+            )
+        elif target.suffix == ".mp4":
             # swipe.mp4, for example, shows the camera path "swipe"; video.mp4 shows the path of the
             # job's options. The loop tells the type checker that the name is one of the paths.
             trajectory = options.trajectory
