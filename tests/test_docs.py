@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from spackle.cli import app
+from spackle.paper.demo import RESULT_FILES
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("docs", "integrations", "research", "src")
@@ -73,3 +74,21 @@ def test_the_command_line_accepts_the_commands_in_the_docs(line: str) -> None:
     while isinstance(command, TyperGroup):
         command = command.commands[words.pop(0)]
     command.make_context(line, words)
+
+
+def test_the_first_block_of_the_readme_can_be_typed_in_its_order() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    block = readme.partition("```bash\n")[2].partition("```")[0]
+    commands = [shlex.split(line, comments=True) for line in block.splitlines() if line]
+    # Nothing is there before but a checkout: its make installs, and the environment is opened.
+    assert [words[0] for words in commands[:2]] == ["make", "."]
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert f"\n{commands[0][1]}: $(VENV)/" in makefile
+    written = {f"demo-output/{name}" for name in RESULT_FILES}
+    for words in commands[2:]:
+        assert words[0] == "spackle"
+        assert words[2] in written, "no command before has written it"
+        if words[1] == "predict":
+            folder = f"{words[words.index('-o') + 1]}/{Path(words[2]).stem}"
+            written |= {f"{folder}/{name}" for name in ("scene.ply", "video.mp4", "report.json")}
+    assert len(commands) == 4

@@ -212,10 +212,10 @@ def _explanation(scores: dict[str, Any]) -> str:
     """A line below the table: what the two measures reward, or how to get the second one."""
     if not scores["distance"]:
         return (
-            "The network shows in the perceptual distance, which needs `spackle weights get "
-            "squeezenet` (0.7 MB): PSNR rewards smooth colours."
+            "PSNR counts each pixel alone; `spackle weights get squeezenet` (0.7 MB) adds the "
+            "distance of what a network for pictures sees, which shows where Spackle's helps."
         )
     return (
-        "PSNR rewards smooth colours, as of the initial Gaussians; the distance, by a network's "
-        "features, rewards structure as in the true photo, which the trained weights add."
+        "PSNR counts each pixel alone, so that a detail in a slightly wrong place costs more than "
+        "none; the distance compares what a network for pictures sees."
     )
