@@ -1,13 +1,19 @@
 // Where scenes come from: this very file, or the server that handed out the page.
 import { gunzip } from "./bytes.js";
+import { expand } from "./compact.js";
 
 /** The scene in this file, or null where a server has it. */
 export async function embedded() {
   const element = document.getElementById("spackle-scene");
   if (!element) return null;
-  const { description, files } = JSON.parse(element.textContent);
+  const { description, files, compact } = JSON.parse(element.textContent);
   element.remove(); // the text is as large as the scene
-  return withBytes(description, (file) => gunzip(files[file]));
+  return withBytes(description, async (file) => {
+    const bytes = await gunzip(files[file]);
+    if (!compact.includes(file)) return bytes;
+    const { count } = description.layers.find((layer) => layer.file === file);
+    return expand(bytes, count, description.camera);
+  });
 }
 
 const SCENES = "/api/v1/scenes";
