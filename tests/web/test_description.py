@@ -19,7 +19,7 @@ import pytest
 from helpers import web_work
 from helpers.web_client import PHOTO, SCENES, Reply, Served, form, served
 
-from spackle.web.app import create_app
+from spackle.web.app import Health, Readiness, ScenePage, create_app
 from spackle.web.description import ErrorAnswer, operations
 from spackle.web.jobs import RetentionLimits, SceneState
 
@@ -54,9 +54,10 @@ def check_described(
     if status >= 400:
         assert answer["content"][kind]["schema"]["$ref"].endswith("/ErrorAnswer")
         ErrorAnswer.model_validate(reply.json)
-    elif kind == "application/json" and path != f"{ONE}/files/{{file}}":
-        assert answer["content"][kind]["schema"]["$ref"].endswith("/SceneState")
-        SceneState.model_validate(reply.json)
+    elif kind == "application/json" and "/files/" not in path:
+        name = answer["content"][kind]["schema"]["$ref"].rpartition("/")[2]
+        models = (SceneState, ScenePage, Health, Readiness)
+        {model.__name__: model for model in models}[name].model_validate(reply.json)
 
 
 def test_each_answer_is_described_with_its_status_and_body(
@@ -77,6 +78,11 @@ def test_each_answer_is_described_with_its_status_and_body(
     check(403, SCENES, "POST", server.ask(SCENES, "POST", form(), Host="evil.example"))
     check(401, SCENES, "POST", Served(server.port).send())
 
+    check(200, SCENES, "GET", server.ask(SCENES))
+    check(422, SCENES, "GET", server.ask(f"{SCENES}?limit=0"))
+    for path in ("/healthz", "/readyz"):
+        check(200, path, "GET", Served(server.port).ask(path))
+        check(403, path, "GET", server.ask(path, Host="evil.example"))
     check(200, ONE, "GET", server.ask(f"{SCENES}/{id}"))
     check(404, ONE, "GET", server.ask(f"{SCENES}/none"))
     check(401, ONE, "GET", Served(server.port).ask(f"{SCENES}/{id}"))
@@ -102,7 +108,7 @@ def test_each_answer_is_described_with_its_status_and_body(
 def test_a_fault_of_the_server_is_answered_as_described(
     server: Served, description: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(job: object) -> None:
+    def fail(job: object, place: object) -> None:
         raise KeyError("a secret")
 
     id = server.send().json["id"]
@@ -117,8 +123,10 @@ def test_the_description_names_the_token_the_values_and_examples(
     description: dict[str, Any], tmp_path: Path
 ) -> None:
     for operation in operations(description):
-        assert operation["security"] == [{"token": []}]
-        assert {"401", "403", "500"} < set(operation["responses"])
+        needs_token = operation["tags"] == ["scenes"]
+        assert operation["security"] == ([{"token": []}] if needs_token else [])
+        assert {"403", "500"} < set(operation["responses"])
+        assert ("401" in operation["responses"]) == needs_token
         assert re.fullmatch(r"[a-z_]+", operation["operationId"])
         for answer in operation["responses"].values():
             content = answer.get("content", {}).get("application/json", {})
@@ -147,7 +155,8 @@ def test_the_description_names_the_token_the_values_and_examples(
     # An app that another one mounts leaves access to it, and so knows no token.
     mounted = create_app(tmp_path, web_work.work)
     try:
-        assert "security" not in json.dumps(mounted.openapi())
+        assert "token" not in json.dumps(mounted.openapi()["components"])
+        assert not any(operation.get("security") for operation in operations(mounted.openapi()))
     finally:
         mounted.state.jobs.close()
 

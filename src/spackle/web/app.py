@@ -10,14 +10,15 @@ import contextlib
 import functools
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import uvicorn
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Header, Query, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
 from fastapi.sse import EventSourceResponse
 from jinja2 import Template
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
@@ -27,6 +28,7 @@ import spackle
 from spackle.bases.settings import AUTO
 from spackle.core.image_formats import PHOTO_SUFFIXES
 from spackle.formats.html import read_page_file
+from spackle.runtime.errors import InputError, printable_line
 from spackle.runtime.task_process import TaskFunction
 from spackle.web.callbacks import CallbackSender
 from spackle.web.description import (
@@ -34,16 +36,19 @@ from spackle.web.description import (
     ANY_FORM,
     DELETED,
     FILE,
+    HEALTH,
     MEDIA_TYPES,
     OCTETS,
+    PAGE_OF_STATES,
+    READY,
     REASONS,
     STATE,
     DescribedApp,
     refusals,
     resolve,
 )
-from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, Access, Guard
-from spackle.web.jobs import Job, Jobs, RetentionLimits, SceneState
+from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, STRANGER, Access, Guard
+from spackle.web.jobs import Job, Jobs, RequestKey, RetentionLimits, SceneState, age_key
 from spackle.web.shared_videos import SharedVideo
 from spackle.web.uploads import (
     FILL_FORM,
@@ -73,9 +78,49 @@ POLL_S = 0.1  # seconds between two checks whether a state has changed
 MAX_UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
 MAX_CONNECTIONS = 512  # open at a time; further ones are refused
 MAX_HEAD_S = 10.0  # seconds that a client may take to send the head of a request
+DEFAULT_PAGE_SIZE = 20  # states
+MAX_PAGE_SIZE = 100
 BUSY = object()  # marks a connection that is not idle
 DEFAULT_WORK = SceneWork()
 DEFAULT_LIMITS = RetentionLimits()
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        max_length=200,
+        description="A name of the client's choice for its request: if it repeats the request, the "
+        "answer is the state of the scene of the first one.",
+    ),
+]
+PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Number of states of a page.")]
+PageMark = Annotated[
+    str | None,
+    Query(
+        pattern=r"^[0-9]{1,12}(\.[0-9]{1,12})?-[0-9a-f]{16}$",
+        description="The field `next` of the page before.",
+    ),
+]
+
+
+class ScenePage(BaseModel):
+    """A page of the list of scenes."""
+
+    scenes: list[SceneState]
+    next: str | None = Field(description="What the next page comes `after`; null for the last.")
+
+
+class Health(BaseModel):
+    """A server that runs."""
+
+    status: Literal["ok"] = "ok"
+    version: str | None = None
+    base: str | None = Field(default=None, description="The network for photos that name none.")
+
+
+class Readiness(BaseModel):
+    """A server that can complete photos."""
+
+    status: Literal["ready"] = "ready"
 
 
 def create_app(
@@ -132,9 +177,11 @@ def create_app(
     # `SceneWork` has a method that lists the bases, the networks for a photo's geometry. Another
     # function as `work` has none; clients can then only choose AUTO.
     list_bases = getattr(work, "bases", lambda: [AUTO])
+    base_name = work.base.name if isinstance(work, SceneWork) else None
     public_path = "" if access is None else access.public.path
-    handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes, public_path)
+    handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes, public_path, base_name)
     add_scene_routes(app, handlers)
+    add_status_routes(app, handlers)
     add_page_routes(app, handlers)
     return app
 
@@ -168,7 +215,7 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
         handlers.post_fill,
         status_code=202,
         openapi_extra=FILL_FORM,
-        responses={**ACCEPTED, **refusals(*ANY_FORM, 404, 409)},
+        responses={**ACCEPTED, **refusals(*ANY_FORM, 404)},
     )
     add(
         "POST",
@@ -176,8 +223,9 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
         handlers.post_removal,
         status_code=202,
         openapi_extra=REMOVAL_FORM,
-        responses={**ACCEPTED, **refusals(*ANY_FORM, 404, 409, 415)},
+        responses={**ACCEPTED, **refusals(*ANY_FORM, 404, 415)},
     )
+    add("GET", SCENES_PATH, handlers.list_scenes, responses={**PAGE_OF_STATES, **refusals(422)})
     add("GET", one_scene, handlers.get_state, responses={**STATE, **refusals(404)})
     add(
         "DELETE",
@@ -202,6 +250,26 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
     )
 
 
+def add_status_routes(app: FastAPI, handlers: SceneHandlers) -> None:
+    """Add what those who watch over the server ask for; strangers may, too."""
+    details: dict[str, Any] = {"tags": ["status"], "openapi_extra": {"security": []}}
+    app.add_api_route(
+        "/healthz",
+        handlers.get_health,
+        operation_id="get_health",
+        responses={**HEALTH, **refusals(needs_token=False)},
+        response_model_exclude_none=True,
+        **details,
+    )
+    app.add_api_route(
+        "/readyz",
+        handlers.get_readiness,
+        operation_id="get_readiness",
+        responses={**READY, **refusals(503, needs_token=False)},
+        **details,
+    )
+
+
 def add_page_routes(app: FastAPI, handlers: SceneHandlers) -> None:
     """Add the page and its files to an app, and the description of the HTTP interface."""
 
@@ -219,7 +287,6 @@ def add_page_routes(app: FastAPI, handlers: SceneHandlers) -> None:
 
     # These routes serve the page and are no part of the interface for programs.
     app.add_api_route("/page.json", handlers.get_page_state, include_in_schema=False)
-    app.add_api_route("/healthz", handlers.get_health, include_in_schema=False)
     for path in ("/docs", DOCS_PATH):
         app.add_api_route(path, get_docs, include_in_schema=False)
     # The last route, because it takes every other path.
@@ -236,6 +303,7 @@ class SceneHandlers:
         takes_photos: bool,
         max_bytes: int,
         public_path: str,
+        base_name: str | None,
     ) -> None:
         """Prepare to answer requests.
 
@@ -246,46 +314,100 @@ class SceneHandlers:
             takes_photos: whether a client may send photos; otherwise the page only shows scenes.
             max_bytes: size limit of an upload.
             public_path: the part of an address's path that a proxy takes away, such as "/photos".
+            base_name: the name of the base of photos whose clients choose none, if known.
         """
         self.jobs = jobs
         self.list_bases = list_bases
         self.takes_photos = takes_photos
         self.max_bytes = max_bytes
         self.public_path = public_path
+        self.base_name = base_name
+        self.keys_in_progress: set[str] = set()  # Idempotency-Keys of requests that still arrive
         # One photo is decoded at a time: decoding a large one takes a gigabyte of memory.
         self.decoding = asyncio.Lock()
 
-    async def post_photo(self, request: Request, response: Response) -> SceneState:
+    async def post_photo(
+        self, request: Request, response: Response, idempotency_key: IdempotencyKey = None
+    ) -> SceneState:
         """Send a photo. The photo is queued; if the queue is full, the answer is 429."""
         bases = self.list_bases()
         accept = functools.partial(accept_photo, bases=bases)
-        return await self._accept(request, response, accept)
+        return await self._accept(request, response, idempotency_key, accept)
 
-    async def post_fill(self, id: str, request: Request, response: Response) -> SceneState:
+    async def post_fill(
+        self, id: str, request: Request, response: Response, idempotency_key: IdempotencyKey = None
+    ) -> SceneState:
         """Fill a finished scene where views show holes; the result is another scene.
 
         Its file report.json says how many Gaussians were added.
         """
         accept = functools.partial(accept_fill, parent=self.find_finished(id))
-        return await self._accept(request, response, accept)
+        return await self._accept(request, response, idempotency_key, accept)
 
-    async def post_removal(self, id: str, request: Request, response: Response) -> SceneState:
+    async def post_removal(
+        self, id: str, request: Request, response: Response, idempotency_key: IdempotencyKey = None
+    ) -> SceneState:
         """Take the thing that a mask marks out of a finished scene, and fill what it hid.
 
         The result is another scene. Its file removed.ply is the scene without the thing, before
         anything was filled; report.json says how many Gaussians were removed and added.
         """
         accept = functools.partial(accept_removal, parent=self.find_finished(id))
-        return await self._accept(request, response, accept)
+        return await self._accept(request, response, idempotency_key, accept)
 
     async def _accept(
-        self, request: Request, response: Response, accept: Callable[..., Job]
+        self,
+        request: Request,
+        response: Response,
+        idempotency_key: str | None,
+        accept: Callable[..., Job],
     ) -> SceneState:
         """Receive a form, have `accept` check and queue it, and answer with the job's state.
 
-        `accept` takes the form, a folder for its files, and `jobs`. HTTPException 429 if the queue
-        is full, 408 for a form that comes too slowly.
+        A request that repeats an earlier one with the same key is answered with the earlier job.
+
+        Args:
+            request: the request, with the form.
+            response: gets the address of the job's state.
+            idempotency_key: what the client calls its request, or None.
+            accept: takes the form, a folder for its files, `jobs`, and the key.
+
+        Raises:
+            HTTPException: 429 if the queue is full, 408 for a form that comes too slowly, 409 if a
+                request with the same key still arrives, 422 if the key belongs to another request.
         """
+        if idempotency_key is None:
+            job = await self._receive(request, accept, None)
+        else:
+            key = RequestKey(idempotency_key, request.url.path.removeprefix(self._root(request)))
+            job = await self._receive_once(request, accept, key)
+
+        # A proxy may have taken another part of the path away.
+        path = f"{self.public_path}{self._root(request)}{SCENES_PATH}/{job.id}"
+        response.headers["Location"] = path
+        return self.state_of(job)
+
+    async def _receive_once(
+        self, request: Request, accept: Callable[..., Job], key: RequestKey
+    ) -> Job:
+        """The job of a request with a key: that of an earlier one, or a new one."""
+        if key.idempotency_key in self.keys_in_progress:
+            raise HTTPException(409, "a request with this Idempotency-Key still arrives")
+        former = self.jobs.with_key(key.idempotency_key)
+        if former is None:
+            self.keys_in_progress.add(key.idempotency_key)
+            try:
+                return await self._receive(request, accept, key)
+            finally:
+                self.keys_in_progress.discard(key.idempotency_key)
+        if former.request_path != key.request_path:
+            raise HTTPException(422, "Idempotency-Key: it belongs to another request")
+        return former
+
+    async def _receive(
+        self, request: Request, accept: Callable[..., Job], key: RequestKey | None
+    ) -> Job:
+        """The new job of a form; see `_accept`."""
         # The place is reserved first, so that a refused photo is not even received.
         with self.jobs.reserve_place() as upload_folder:
             try:
@@ -297,19 +419,42 @@ class SceneHandlers:
                 raise HTTPException(408, "the photo arrived too slowly") from None
             try:
                 async with self.decoding:
-                    job = await run_in_threadpool(accept, form, upload_folder, self.jobs)
+                    return await run_in_threadpool(accept, form, upload_folder, self.jobs, key)
             finally:
                 await form.close()
 
-        # The root path holds the token, or the place where another app has mounted this one. A
-        # proxy may have taken another part of the path away.
-        path = f"{self.public_path}{request.scope['root_path']}{SCENES_PATH}/{job.id}"
-        response.headers["Location"] = path
-        return job
+    @staticmethod
+    def _root(request: Request) -> str:
+        """The root path, which holds the token, or the place where another app has mounted this."""
+        root: str = request.scope["root_path"]
+        return root
+
+    def state_of(self, job: Job) -> SceneState:
+        """The state of a job as clients see it, with its place and the files that exist now."""
+        return state_with_files(job, self.jobs.place_of(job))
+
+    async def list_scenes(
+        self, limit: PageSize = DEFAULT_PAGE_SIZE, after: PageMark = None
+    ) -> ScenePage:
+        """The states of all photos, the newest first, in pages."""
+        # Somebody who may only look at a scene must know its id.
+        if not self.takes_photos:
+            raise HTTPException(401, "this page lists no scenes: it was opened without a token")
+        mark = None
+        if after is not None:
+            created, _, id = after.partition("-")
+            mark = (float(created), id)
+        # One job more than asked for shows whether another page follows.
+        jobs = self.jobs.page(limit + 1, mark)
+        scenes = [self.state_of(job) for job in jobs[:limit]]
+        next_mark = None
+        if len(jobs) > limit:
+            next_mark = "{!r}-{}".format(*age_key(jobs[limit - 1]))
+        return ScenePage(scenes=scenes, next=next_mark)
 
     async def get_state(self, id: str) -> SceneState:
         """The state of a photo and its files."""
-        return state_with_files(self.find_job(id))
+        return self.state_of(self.find_job(id))
 
     async def delete_scene(self, id: str) -> None:
         """Delete a photo and its scene, and end work on it."""
@@ -319,6 +464,7 @@ class SceneHandlers:
     async def get_events(self, id: str) -> AsyncIterator[SceneState]:
         """Server-sent events: the state, now and at each change, until the work has ended."""
         last_sent: Job | None = None
+        last_place: int | None = None
         while last_sent is None or last_sent.ended is None:
             job = self.jobs.by_id.get(id)
             if job is None:
@@ -329,9 +475,11 @@ class SceneHandlers:
                 )
                 return
             # A change replaces the job by another object.
-            if job is not last_sent:
+            place = self.jobs.place_of(job)
+            if job is not last_sent or place != last_place:
                 last_sent = job
-                yield state_with_files(job)
+                last_place = place
+                yield state_with_files(job, place)
             await asyncio.sleep(POLL_S)
 
     async def get_file(self, id: str, file: FileName | PagePart) -> FileResponse:
@@ -370,9 +518,19 @@ class SceneHandlers:
             }
         }
 
-    async def get_health(self) -> dict[str, str]:
-        """An answer that says that the server runs, for those who watch over it."""
-        return {"status": "ok"}
+    async def get_health(self, request: Request) -> Health:
+        """Whether the server runs; with the token also its version and its base."""
+        if request.scope.get(STRANGER):
+            return Health()
+        return Health(version=spackle.__version__, base=self.base_name)
+
+    async def get_readiness(self) -> Readiness:
+        """Whether the server can complete photos: a worker runs, and the disk has space."""
+        try:
+            await run_in_threadpool(self.jobs.check_ready)
+        except InputError as error:
+            raise HTTPException(503, str(error)) from error
+        return Readiness()
 
     def find_finished(self, id: str) -> Job:
         """The job with an id; HTTPException 404 if there is none, 409 if it has no scene yet."""
@@ -395,10 +553,10 @@ def path_of_file(job: Job, file: str) -> Path:
     return folder / file
 
 
-def state_with_files(job: Job) -> SceneState:
-    """The state of a job as clients see it, with the files that exist now."""
+def state_with_files(job: Job, place: int | None = None) -> SceneState:
+    """The state of a job as clients see it, with its place and the files that exist now."""
     files = [file for file in LISTED_FILES if path_of_file(job, file).is_file()]
-    return job.model_copy(update={"files": files})
+    return job.model_copy(update={"files": files, "place": place})
 
 
 async def error_answer(request: Request, error: Any) -> JSONResponse:
@@ -410,7 +568,13 @@ async def error_answer(request: Request, error: Any) -> JSONResponse:
     """
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-    return JSONResponse({"error": "there is nothing with that name"}, 404)
+    # A bad part of the path is the name of something that does not exist.
+    problem = error.errors()[0]
+    place, *name = problem["loc"]
+    if place == "path":
+        return JSONResponse({"error": "there is nothing with that name"}, 404)
+    line = printable_line(f"{'.'.join(map(str, name))}: {problem['msg'].lower()}")
+    return JSONResponse({"error": line}, 422)
 
 
 async def fault_answer(request: Request, error: Exception) -> JSONResponse:

@@ -47,7 +47,10 @@ REASONS = {
     ),
     404: ("There is no such scene or file.", "there is no such scene"),
     408: ("The form arrived too slowly.", "the photo arrived too slowly"),
-    409: ("The scene is not done, or failed.", "this scene is not done yet"),
+    409: (
+        "The scene is not done, or failed; or a request with this Idempotency-Key still arrives.",
+        "this scene is not done yet",
+    ),
     413: ("The upload is too large.", "more than 200 MB: send a smaller photo"),
     415: ("A file is no picture of a known kind.", "notes.txt: not an image: give a photo"),
     422: (
@@ -58,10 +61,11 @@ REASONS = {
         "Too many photos wait. The header Retry-After says after how many seconds to ask again.",
         "too many photos are waiting: try again in 10 seconds",
     ),
+    503: ("The server cannot work now.", "the disk of the folder of scenes is full: 3 MB are left"),
     500: ("The server has a fault.", "internal error: the reason is in the server's log"),
 }
-ANY_REQUEST = (401, 403, 500)  # the statuses with which any request can be refused
-ANY_FORM = (400, 408, 413, 422, 429)  # and those of any form that is sent
+ANY_REQUEST = (403, 500)  # the statuses with which any request can be refused
+ANY_FORM = (400, 408, 409, 413, 422, 429)  # and those of any form that is sent
 
 STATE_EXAMPLE: dict[str, Any] = {
     "id": "6f1c2a9b0d3e4f58",
@@ -72,12 +76,20 @@ STATE_EXAMPLE: dict[str, Any] = {
     "line": "focal length 1234 px (from the photo)",
     "error": None,
     "files": ["photo.jpg"],
+    "place": None,
     "created": 1790000000.0,
     "ended": None,
     "parent": None,
     "edit": None,
 }
-QUEUED_EXAMPLE = {**STATE_EXAMPLE, "state": "queued", "stage": None, "share": None, "line": None}
+QUEUED_EXAMPLE = {
+    **STATE_EXAMPLE,
+    "state": "queued",
+    "place": 2,
+    "stage": None,
+    "share": None,
+    "line": None,
+}
 # What an answer of 202 contains beside the state of the new scene.
 ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
@@ -97,6 +109,24 @@ STATE: dict[int | str, dict[str, Any]] = {
         "content": {JSON: {"example": STATE_EXAMPLE}},
     }
 }
+PAGE_OF_STATES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "A page of states.",
+        "content": {JSON: {"example": {"scenes": [STATE_EXAMPLE], "next": None}}},
+    }
+}
+HEALTH: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The server runs.",
+        "content": {JSON: {"example": {"status": "ok", "version": "0.1.0", "base": "auto"}}},
+    }
+}
+READY: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The server can complete photos.",
+        "content": {JSON: {"example": {"status": "ready"}}},
+    }
+}
 DELETED: dict[int | str, dict[str, Any]] = {204: {"description": "It is deleted."}}
 FILE: dict[int | str, dict[str, Any]] = {
     200: {
@@ -114,10 +144,14 @@ class ErrorAnswer(BaseModel):
     error: str = Field(description="The reason, in a line.")
 
 
-def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The description of refusals, by status; those of any request are among them."""
+def refusals(*statuses: int, needs_token: bool = True) -> dict[int | str, dict[str, Any]]:
+    """The description of refusals, by status; those of any request are among them.
+
+    `needs_token` says whether a request is also refused without the token.
+    """
     answers: dict[int | str, dict[str, Any]] = {}
-    for status in (*ANY_REQUEST, *statuses):
+    token_statuses = [401] if needs_token else []
+    for status in (*ANY_REQUEST, *token_statuses, *statuses):
         meaning, example = REASONS[status]
         answers[status] = {
             "model": ErrorAnswer,

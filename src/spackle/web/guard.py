@@ -29,6 +29,8 @@ LOG = logging.getLogger("spackle.web")
 HOST_PATTERN = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
 # Values of Sec-Fetch-Site that are admitted; none: an address that a person typed, or a bookmark.
 OWN_SITES = {"same-origin", "none"}
+STATUS_PATHS = {"/healthz", "/readyz"}  # tell everybody whether the server runs, and no more
+STRANGER = "spackle.stranger"  # marks a request without the token, in its scope
 MAX_SEND_S = 20.0  # seconds that a client may take to read a part of an answer
 MAX_UPLOAD_BYTES = 200_000_000  # of an upload: photo and depth map
 # The page loads scripts and styles from this server only and sends nothing elsewhere; no other page
@@ -106,11 +108,13 @@ class Access(NamedTuple):
             return scope
 
         # The request has no valid token. A server that was started without one lets everybody read,
-        # but nobody send photos. A server with a token only says whether it runs.
+        # but nobody send photos. A server with a token only says whether it runs and is ready.
         if self.token is None:
             if scope["method"] not in ("GET", "HEAD"):
                 raise HTTPException(401, "this page takes no photos: it was opened without a token")
-        elif path != "/healthz":
+        elif path in STATUS_PATHS:
+            return {**scope, STRANGER: True}
+        else:
             raise HTTPException(401, "this needs the token that the server printed")
         return scope
 

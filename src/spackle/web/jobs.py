@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 from fastapi import HTTPException
 from pydantic import BaseModel, Field
 
-from spackle.runtime.errors import InputError, reason_in_a_line
+from spackle.runtime.errors import InputError, as_input_error, reason_in_a_line
 from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import StageProgress
@@ -28,6 +28,7 @@ LOG = logging.getLogger("spackle.web")
 RECORD_FILE = "job.json"  # stores the state of a job, in the folder of the job
 UPLOAD_PREFIX = ".new-"  # begins the names of folders of incomplete uploads
 RETRY_AFTER_S = 10  # seconds after which a client may try again if the queue was full
+MIN_FREE_BYTES = 200_000_000  # that a photo with its results may take
 TIDY_INTERVAL_S = 60.0  # seconds between two searches for results that are too old
 
 
@@ -51,6 +52,13 @@ class Edit(NamedTuple):
     mask: str | None = None  # the mask's file, a name in the job's folder
 
 
+class RequestKey(NamedTuple):
+    """What a client has called a request, so that it can repeat it without another scene."""
+
+    idempotency_key: str
+    request_path: str
+
+
 class SceneState(BaseModel):
     """The state of a photo, as clients see it."""
 
@@ -65,6 +73,10 @@ class SceneState(BaseModel):
     error: str | None = Field(default=None, description="Why it failed, in a line.")
     files: list[str] = Field(
         default=[], description="Existing files; a finished scene can make more."
+    )
+    place: int | None = Field(
+        default=None,
+        description="Number of photos that come before, while it is queued; 0: it is the next.",
     )
     created: float = Field(default_factory=time.time, description="Seconds since 1970.")
     ended: float | None = None
@@ -87,6 +99,9 @@ class Job(SceneState):
     cameras: list[dict[str, Any]] = []
     mask: str | None = None
     callback_url: str | None = None  # is told the state at the end; None afterwards
+    # What the client called its request, and where it sent it, so that it can repeat the request.
+    idempotency_key: str | None = None
+    request_path: str | None = None
     folder: Path = Field(default=Path(), exclude=True)
 
     @property
@@ -137,7 +152,8 @@ class Jobs:
         self._folder_lock.enter_context(results_folder(folder, locked=True))
 
         self.by_id: dict[str, Job] = {}
-        self._lock = threading.RLock()  # of `by_id`, and of the processes
+        self._queue: list[str] = []  # ids of the jobs that wait, the next one first
+        self._lock = threading.RLock()  # of `by_id`, of the queue, and of the processes
         self._is_closed = threading.Event()
         self._work = work
         self._processes: list[TaskProcess] = []
@@ -168,7 +184,61 @@ class Jobs:
         for job in sorted(self.by_id.values(), key=lambda job: job.created):
             if job.ended is None:
                 self._change(job.id, state="queued")
-                self._scene_threads.submit(self._run, job.id)
+                self._enqueue(job.id)
+
+    def _enqueue(self, id: str) -> None:
+        """Let a job wait for a process."""
+        with self._lock:
+            self._queue.append(id)
+            self._scene_threads.submit(self._run, id)
+
+    def _dequeue(self, id: str) -> None:
+        """Note that a job waits no more: it runs, or is deleted."""
+        with self._lock, contextlib.suppress(ValueError):
+            self._queue.remove(id)
+
+    def place_of(self, job: Job) -> int | None:
+        """The number of jobs that come before one that waits; None for one that does not wait."""
+        if job.state != "queued":
+            return None
+        try:
+            return self._queue.index(job.id)
+        except ValueError:  # it has begun to run, or was deleted
+            return None
+
+    def page(self, count: int, after: tuple[float, str] | None) -> list[Job]:
+        """Up to `count` jobs, the newest first.
+
+        Args:
+            count: the number of jobs.
+            after: time of creation and id of the last job of the page before; None: the first page.
+        """
+        jobs = sorted(self.by_id.values(), key=age_key, reverse=True)
+        if after is not None:
+            # Not the position of that job, which may be deleted by now.
+            jobs = [job for job in jobs if age_key(job) < after]
+        return jobs[:count]
+
+    def with_key(self, key: str) -> Job | None:
+        """The job of the request that a client has named by this key; None if there is none."""
+        for job in list(self.by_id.values()):
+            if job.idempotency_key == key:
+                return job
+        return None
+
+    def check_ready(self) -> None:
+        """InputError if no photo can be completed now, because the disk is full, for example."""
+        if self._is_closed.is_set():
+            raise InputError("the server ends")
+        with self._lock:
+            if not self._processes:
+                raise InputError("the first worker process has not started yet")
+        with as_input_error("the folder of scenes", "cannot be used: {reason}", OSError):
+            free_bytes = shutil.disk_usage(self.folder).free
+        if free_bytes < MIN_FREE_BYTES:
+            raise InputError(
+                f"the disk of the folder of scenes is full: {free_bytes / 1e6:.0f} MB are left"
+            )
 
     def start_callbacks(self, describe: Callable[[Job], SceneState]) -> None:
         """Tell clients the end of their jobs from now on, also of jobs that have ended before.
@@ -238,6 +308,7 @@ class Jobs:
         options: dict[str, Any],
         edit: Edit | None = None,
         callback_url: str | None = None,
+        key: RequestKey | None = None,
     ) -> Job:
         """Add a job for a photo or for an edit of a scene, and queue it; returns the job.
 
@@ -249,6 +320,7 @@ class Jobs:
             options: what the client has set.
             edit: what is to be done to the scene in the file `source`; None for a photo.
             callback_url: an address that `callbacks` accepts, which is told the end; or None.
+            key: the name that the client has given to its request, if any.
         """
         id = folder.name.removeprefix(UPLOAD_PREFIX)
         job = Job(
@@ -265,13 +337,15 @@ class Jobs:
             parts = edit._asdict()
             kind = parts.pop("kind")
             job = job.model_copy(update={"edit": kind, **parts})
+        if key is not None:
+            job = job.model_copy(update=key._asdict())
         job.save()
         # `reserve_place` counts folders and jobs, so the two change together.
         with self._lock:
             job_folder = folder.rename(self.folder / id)
             job = job.model_copy(update={"folder": job_folder})
             self.by_id[id] = job
-        self._scene_threads.submit(self._run, id)
+        self._enqueue(id)
         return job
 
     def make_file(self, job: Job, file: str) -> Future[str | None]:
@@ -296,6 +370,7 @@ class Jobs:
         """Delete a job and its files, and kill the process that works on it."""
         with self._lock:
             job = self.by_id.pop(id, None)
+            self._dequeue(id)
             process = self._process_of_job.pop(id, None)
             if process is not None:
                 process.kill()
@@ -342,6 +417,7 @@ class Jobs:
         """
         process = self._process()
         with self._lock:
+            self._dequeue(id)
             if self._is_closed.is_set() or id not in self.by_id:
                 return
             self._change(id, state="running")
@@ -430,6 +506,11 @@ class Jobs:
             if is_old or total_size > self.limits.size:
                 total_size -= sizes[id]
                 self.remove(id)
+
+
+def age_key(job: Job) -> tuple[float, str]:
+    """What orders jobs by their age: the time of creation, and the id for those of one time."""
+    return job.created, job.id
 
 
 def size_of_folder(folder: Path) -> int:

@@ -26,7 +26,7 @@ from spackle.runtime.errors import InputError, printable_line, unknown_name
 from spackle.runtime.validation import validation_problem
 from spackle.web.description import BINARY_FILE, describe_form
 from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, sent_mask
-from spackle.web.jobs import Edit, Job, Jobs
+from spackle.web.jobs import Edit, Job, Jobs, RequestKey
 from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions, check_photo
 
 MAX_NAME_CHARACTERS = 80
@@ -82,13 +82,21 @@ REMOVAL_FORM = describe_form(RemovalRequest, "mask", "options", mask=MASK_FIELD)
 FORM_MODELS = (SceneOptions, FillRequest, RemovalRequest)  # of the fields `options`
 
 
-def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[str]) -> Job:
+def accept_photo(
+    form: FormData,
+    upload_folder: Path,
+    jobs: Jobs,
+    key: RequestKey | None,
+    *,
+    bases: list[str],
+) -> Job:
     """Store a form's photo, check that it can be decoded, and queue it; returns its job.
 
     Args:
         form: `photo` (a file), and perhaps `depth` (a file) and `options` (JSON).
         upload_folder: an empty folder for the files, which `jobs` has reserved.
         jobs: receives the new job.
+        key: the name that the client has given to its request, if any.
         bases: the names of the bases, the networks for a photo's geometry, that may be chosen.
 
     Raises:
@@ -129,10 +137,13 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
         depth=depth_file,
         options=given_options,
         callback_url=callback_url,
+        key=key,
     )
 
 
-def accept_fill(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: Job) -> Job:
+def accept_fill(
+    form: FormData, upload_folder: Path, jobs: Jobs, key: RequestKey | None, *, parent: Job
+) -> Job:
     """Check a form that asks for a fill of a finished scene, and queue it; returns its job.
 
     HTTPException 422 for a form without cameras, or with impossible ones.
@@ -143,10 +154,12 @@ def accept_fill(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: Job)
         _check_view(camera, f"cameras.{index}")
     edit = Edit("fill", parent.id, cameras)
     callback_url = jobs.callbacks.check(form.get("callback_url"))
-    return _add_edit(edit, upload_folder, jobs, parent, callback_url)
+    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key)
 
 
-def accept_removal(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: Job) -> Job:
+def accept_removal(
+    form: FormData, upload_folder: Path, jobs: Jobs, key: RequestKey | None, *, parent: Job
+) -> Job:
     """Check a form with the mask of a thing in a finished scene, and queue it; returns its job.
 
     HTTPException 422 for a form without mask or camera, or with an impossible camera; 415 for a
@@ -165,7 +178,7 @@ def accept_removal(form: FormData, upload_folder: Path, jobs: Jobs, *, parent: J
         raise HTTPException(415, str(error)) from error
     edit = Edit("remove", parent.id, [camera], MASK_FILE)
     callback_url = jobs.callbacks.check(form.get("callback_url"))
-    return _add_edit(edit, upload_folder, jobs, parent, callback_url)
+    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key)
 
 
 def _edit_options(form: FormData, model: type[MODEL]) -> MODEL:
@@ -193,7 +206,12 @@ def _check_view(camera: dict[str, Any], where: str) -> None:
 
 
 def _add_edit(
-    edit: Edit, upload_folder: Path, jobs: Jobs, parent: Job, callback_url: str | None
+    edit: Edit,
+    upload_folder: Path,
+    jobs: Jobs,
+    parent: Job,
+    callback_url: str | None,
+    key: RequestKey | None,
 ) -> Job:
     """Queue an edit of a scene, with files of its own; returns its job.
 
@@ -215,6 +233,7 @@ def _add_edit(
         options={**parent.options, "files": []},
         edit=edit,
         callback_url=callback_url,
+        key=key,
     )
 
 

@@ -1,0 +1,113 @@
+"""What clients and operators of a busy server ask: is it ready, who waits, which scenes exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from helpers.web_client import PHOTO, SCENES, Served, eventually, form, served
+
+import spackle
+from spackle.web.jobs import SceneState
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with served(tmp_path_factory.mktemp("scenes")) as server:
+        yield server
+
+
+def test_strangers_learn_that_the_server_runs_and_clients_its_version(server: Served) -> None:
+    assert Served(server.port).ask("/healthz").json == {"status": "ok"}
+    assert server.ask("/healthz").json == {"status": "ok", "version": spackle.__version__}
+
+
+def test_the_server_is_ready_when_a_worker_runs_and_the_disk_has_space(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stranger = Served(server.port)
+    eventually(lambda: stranger.ask("/readyz").status == 200)
+    assert stranger.ask("/readyz").json == {"status": "ready"}
+    monkeypatch.setattr(
+        "spackle.web.jobs.shutil.disk_usage", lambda folder: SimpleNamespace(free=5_000_000)
+    )
+    reply = stranger.ask("/readyz")
+    assert reply.status == 503
+    assert reply.json["error"].endswith("is full: 5 MB are left")
+    assert str(server.jobs.folder) not in reply.json["error"]
+
+
+def test_a_waiting_photo_knows_its_place_in_the_queue(tmp_path: Path) -> None:
+    with served(tmp_path) as server:
+        slow = server.send(name="slow.png").json["id"]
+        eventually(lambda: server.ask(f"{SCENES}/{slow}").json["stage"] == "base")
+        sent = [server.send(name=f"{k}.png").json for k in range(3)]
+        assert [state["place"] for state in sent] == [0, 1, 2]
+        assert server.ask(f"{SCENES}/{slow}").json["place"] is None
+
+        # One before it goes away, so it comes nearer.
+        assert server.ask(f"{SCENES}/{sent[1]['id']}", "DELETE").status == 204
+        assert server.ask(f"{SCENES}/{sent[2]['id']}").json["place"] == 1
+        assert server.ask(f"{SCENES}/{slow}", "DELETE").status == 204
+        told = server.events(sent[2]["id"])
+        assert told[-1]["state"] == "done"
+        assert told[-1]["place"] is None
+
+
+def test_all_scenes_are_listed_in_pages_the_newest_first(tmp_path: Path) -> None:
+    with served(tmp_path) as server:
+        sent = [server.send(name=f"{k}.png").json["id"] for k in range(5)]
+        newest_first = sent[::-1]
+
+        def page(query: str) -> tuple[list[str], Any]:
+            answer = server.ask(f"{SCENES}?{query}").json
+            return [state["id"] for state in answer["scenes"]], answer["next"]
+
+        assert page("") == (newest_first, None)
+        assert set(server.ask(SCENES).json["scenes"][0]) == set(SceneState.model_fields)
+        ids, mark = page("limit=2")
+        assert ids == newest_first[:2]
+        # Neither a deletion nor a newer photo moves the pages that follow.
+        assert server.ask(f"{SCENES}/{ids[1]}", "DELETE").status == 204
+        server.send(name="later.png")
+        ids, mark = page(f"limit=2&after={mark}")
+        assert ids == newest_first[2:4]
+        assert page(f"limit=2&after={mark}") == (newest_first[4:], None)
+        for query in ("limit=0", "limit=101", "limit=x", "after=x", "after=-"):
+            reply = server.ask(f"{SCENES}?{query}")
+            assert (reply.status, query.partition("=")[0] in reply.json["error"]) == (422, True)
+    with served(tmp_path / "open", token=None) as free:
+        assert free.ask(SCENES).status == 401  # who may only look must know an id
+
+
+def test_a_repeated_request_with_its_key_makes_no_second_scene(tmp_path: Path) -> None:
+    with served(tmp_path) as server:
+
+        def send(key: str, path: str = SCENES) -> Any:
+            return server.ask(path, "POST", form(PHOTO), Idempotency_Key=key)
+
+        first = send("order 7")
+        again = send("order 7")
+        assert (first.status, again.status) == (202, 202)
+        assert first.json["id"] == again.json["id"]
+        assert first.headers["location"] == again.headers["location"]
+        other = send("order 8").json["id"]
+        assert other != first.json["id"]
+        assert server.events(other)[-1]["state"] == "done"
+
+        # A refused request takes no key, and a key belongs to one kind of request.
+        assert server.ask(SCENES, "POST", form(b"x"), Idempotency_Key="order 9").status == 415
+        assert send("order 9").status == 202
+        assert send("order 7", f"{SCENES}/{other}/fill").status == 422
+        assert "idempotency_key" not in server.ask(f"{SCENES}/{other}").json
+
+    # The key outlives the server, and ends with the scene.
+    with served(tmp_path) as server:
+        reply = server.ask(SCENES, "POST", form(PHOTO), Idempotency_Key="order 8")
+        assert reply.json["id"] == other
+        assert server.ask(f"{SCENES}/{other}", "DELETE").status == 204
+        reply = server.ask(SCENES, "POST", form(PHOTO), Idempotency_Key="order 8")
+        assert reply.json["id"] != other
