@@ -11,7 +11,7 @@ import pytest
 from helpers.web_client import PHOTO, SCENES, Served, eventually, form, served
 
 import spackle
-from spackle.web.jobs import SceneState
+from spackle.web.jobs import RetentionLimits, SceneState
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +55,18 @@ def test_a_waiting_photo_knows_its_place_in_the_queue(tmp_path: Path) -> None:
         told = server.events(sent[2]["id"])
         assert told[-1]["state"] == "done"
         assert told[-1]["place"] is None
+
+
+def test_a_photo_that_takes_too_long_fails_and_the_next_one_begins(tmp_path: Path) -> None:
+    with served(tmp_path, keep=RetentionLimits(work_s=60)) as server:
+        # Once the worker runs, the limit may be short.
+        assert server.events(server.send().json["id"])[-1]["state"] == "done"
+        server.jobs.limits = RetentionLimits(work_s=1)
+        slow = server.events(server.send(name="slow.png").json["id"])[-1]
+        assert slow["state"] == "failed"
+        assert slow["error"] == "slow.png: took longer than 1 seconds, the limit"
+        server.jobs.limits = RetentionLimits(work_s=60)
+        assert server.events(server.send().json["id"])[-1]["state"] == "done"
 
 
 def test_all_scenes_are_listed_in_pages_the_newest_first(tmp_path: Path) -> None:

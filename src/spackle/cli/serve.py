@@ -60,6 +60,15 @@ def serve(
             min=1, metavar="N", help="Number of photos that may wait; more photos are refused."
         ),
     ] = 32,
+    timeout: Annotated[
+        float | None,
+        typer.Option(
+            min=1,
+            metavar="SECONDS",
+            show_default="no limit",
+            help="Seconds that the work on a photo may take; then it fails.",
+        ),
+    ] = None,
     allowed_host: Annotated[
         list[str] | None,
         typer.Option(
@@ -119,7 +128,7 @@ def serve(
         output,
         SceneWork(base_settings, verbose=verbose),
         workers,
-        RetentionLimits(keep * SECONDS_A_DAY, quota * BYTES_A_GB, waiting),
+        RetentionLimits(keep * SECONDS_A_DAY, quota * BYTES_A_GB, waiting, timeout),
         ServerAddress(
             host=host,
             port=port,

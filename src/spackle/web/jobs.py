@@ -33,11 +33,12 @@ TIDY_INTERVAL_S = 60.0  # seconds between two searches for results that are too 
 
 
 class RetentionLimits(NamedTuple):
-    """Limits of the folder; the oldest finished jobs are removed first."""
+    """Limits of the folder, of which the oldest finished jobs are removed first, and of a job."""
 
     seconds: float = 7 * 86400.0  # since a job ended: a week
     size: float = 20e9  # bytes
     waiting: int = 32  # jobs in the queue
+    work_s: float | None = None  # seconds that the work on a photo may take; None: any time
 
 
 EditKind = Literal["fill", "remove"]
@@ -159,6 +160,7 @@ class Jobs:
         self._processes: list[TaskProcess] = []
         self._own_process = threading.local()  # the process of the calling thread
         self._process_of_job: dict[str, TaskProcess] = {}  # by the id of a running job
+        self._timed_out: set[str] = set()  # ids of running jobs that took too long
         # Each process that makes scenes has a number, which chooses its GPU. A single process, and
         # the one that adds files, have none: they use torch's default GPU.
         self._gpu_numbers = iter(range(workers) if workers > 1 else ())
@@ -431,7 +433,8 @@ class Jobs:
             job.save()
             task = (job, None)  # None: the scene, not a further file of it
             # The reason why the scene could not be made; None if it is finished.
-            error = process.do(task, lambda event: self._note_event(id, event))
+            with self._time_limit(id, process):
+                error = process.do(task, lambda event: self._note_event(id, event))
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
 
@@ -439,9 +442,35 @@ class Jobs:
         # passes until this process is closed, too, and then the job has not failed.
         if error == WORKER_DIED:
             self._is_closed.wait(1)
-        self._process_of_job.pop(id, None)
+        with self._lock:
+            self._process_of_job.pop(id, None)
+            if id in self._timed_out:
+                self._timed_out.discard(id)
+                error = f"{job.name}: took longer than {self.limits.work_s:g} seconds, the limit"
         if not self._is_closed.is_set():
             self._record_end(id, error)
+
+    @contextlib.contextmanager
+    def _time_limit(self, id: str, process: TaskProcess) -> Iterator[None]:
+        """Kill the process of a job if the block takes longer than the limit."""
+        if self.limits.work_s is None:
+            yield
+            return
+
+        def end_job() -> None:
+            with self._lock:
+                # The job may have ended in this moment, and the process may have another one.
+                if self._process_of_job.get(id) is process:
+                    self._timed_out.add(id)
+                    process.kill()
+
+        timer = threading.Timer(self.limits.work_s, end_job)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
 
     def _note_event(self, id: str, event: TaskEvent) -> None:
         """Note in a job's state what its process reports: {line}, or a `StageProgress`."""
