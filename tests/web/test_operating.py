@@ -11,7 +11,9 @@ import pytest
 from helpers.web_client import PHOTO, SCENES, Served, eventually, form, served
 
 import spackle
+from spackle.runtime.errors import InputError
 from spackle.web.jobs import RetentionLimits, SceneState
+from spackle.web.public_address import PublicAddress
 
 
 @pytest.fixture(scope="module")
@@ -123,3 +125,35 @@ def test_a_repeated_request_with_its_key_makes_no_second_scene(tmp_path: Path) -
         assert server.ask(f"{SCENES}/{other}", "DELETE").status == 204
         reply = server.ask(SCENES, "POST", form(PHOTO), Idempotency_Key="order 8")
         assert reply.json["id"] != other
+
+
+def test_pages_of_an_admitted_site_and_of_no_other_use_the_interface(tmp_path: Path) -> None:
+    gallery = "https://gallery.example.com"
+    public = PublicAddress(page_origins=(gallery,))
+    with served(tmp_path, public=public) as server:
+        from_page = {"Origin": gallery, "Sec_Fetch_Site": "cross-site"}
+
+        # The browser asks first, without the token, what the page may send.
+        bare = Served(server.port)
+        question = bare.ask(SCENES, "OPTIONS", Access_Control_Request_Method="POST", **from_page)
+        assert (question.status, question.body) == (204, b"")
+        assert question.headers["access-control-allow-origin"] == gallery
+        assert "Authorization" in question.headers["access-control-allow-headers"]
+        assert "access-control-allow-credentials" not in question.headers
+
+        reply = bare.ask(SCENES, Authorization="Bearer s3cret", **from_page)
+        assert reply.status == 200
+        assert reply.headers["access-control-allow-origin"] == gallery
+        assert (reply.headers["vary"], reply.headers["x-frame-options"]) == ("Origin", "DENY")
+        assert bare.ask(SCENES, **from_page).status == 401  # the token is still needed
+        assert bare.ask(SCENES, Host="evil.example", **from_page).status == 403
+
+        for origin in ("https://evil.example", f"{gallery}.evil.example", "null", gallery + ":1"):
+            other = {**from_page, "Origin": origin}
+            for method in ("GET", "OPTIONS"):
+                refused = server.ask(SCENES, method, Access_Control_Request_Method="GET", **other)
+                assert refused.status == 403
+                assert "access-control-allow-origin" not in refused.headers
+    for bad in ("*", "gallery.example.com", "https://gallery.example.com/", "null"):
+        with pytest.raises(InputError, match="cors"):
+            PublicAddress(page_origins=(bad,))

@@ -101,6 +101,14 @@ def serve(
             "may be repeated.",
         ),
     ] = None,
+    cors: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ORIGIN",
+            help="Origin of another site whose pages may use the interface with the token, such as "
+            "https://gallery.example.com; may be repeated.",
+        ),
+    ] = None,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")
     ] = "auto",
@@ -137,6 +145,7 @@ def serve(
                 allowed_hosts=tuple(allowed_host or ()),
                 url=public_url,
                 proxies=tuple(proxy or ()),
+                page_origins=tuple(cors or ()),
             ),
             callback_hosts=tuple(callback_host or ()),
         ),

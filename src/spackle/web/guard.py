@@ -18,7 +18,7 @@ from typing import NamedTuple
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.responses import JSONResponse
+from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from spackle.runtime.errors import printable_line
@@ -30,6 +30,17 @@ HOST_PATTERN = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IG
 # Values of Sec-Fetch-Site that are admitted; none: an address that a person typed, or a bookmark.
 OWN_SITES = {"same-origin", "none"}
 STATUS_PATHS = {"/healthz", "/readyz"}  # tell everybody whether the server runs, and no more
+# What a page of an admitted other site may do (CORS), and what it may read of an answer's headers.
+PREFLIGHT_HEADERS = {
+    "Access-Control-Allow-Methods": "GET, POST, DELETE",
+    "Access-Control-Allow-Headers": "Authorization, Content-Type, Idempotency-Key",
+    "Access-Control-Max-Age": "600",  # seconds that a browser may remember this
+}
+PAGE_HEADERS = {
+    "Access-Control-Expose-Headers": "Location, Retry-After, Content-Disposition",
+    "Vary": "Origin",
+}
+PREFLIGHT = "spackle.preflight"  # marks a browser's question about what it may send
 STRANGER = "spackle.stranger"  # marks a request without the token, in its scope
 MAX_SEND_S = 20.0  # seconds that a client may take to read a part of an answer
 MAX_UPLOAD_BYTES = 200_000_000  # of an upload: photo and depth map
@@ -92,7 +103,13 @@ class Access(NamedTuple):
                 the token.
         """
         hosts = self.public.asked_hosts(headers, scope.get("client"))
-        check_same_site(headers, hosts, self._is_own_name, self.public.origin)
+        page_origin = self.public.admitted_origin(headers)
+        check_same_site(headers, hosts, self._is_own_name, self.public.origin, page_origin)
+
+        # Before a browser sends a request from another site, it asks, without a token, if it may.
+        is_preflight = "access-control-request-method" in headers and scope["method"] == "OPTIONS"
+        if page_origin is not None and is_preflight:
+            return {**scope, PREFLIGHT: True}
 
         # An address of the page holds the token: /TOKEN/viewer.css.
         root = scope["root_path"]  # where another app has mounted this one
@@ -150,6 +167,7 @@ def check_same_site(
     hosts: Sequence[str],
     is_own_name: Callable[[str], bool],
     public_origin: str | None,
+    page_origin: str | None,
 ) -> None:
     """Refuse a request that a page of another site has made a browser send; HTTPException 403.
 
@@ -159,12 +177,16 @@ def check_same_site(
         hosts: the values of Host as the browser sent them.
         is_own_name: whether a host name in lower case belongs to this server.
         public_origin: Origin of the server's own page behind a proxy, or None.
+        page_origin: Origin of the request, if the user of the server has admitted that other site.
     """
     match = HOST_PATTERN.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
     if match is None or not is_own_name(match[1].lower()):
         raise HTTPException(
             403, "this server does not have that Host name: whoever runs it can allow the name"
         )
+
+    if page_origin is not None:
+        return
 
     # Through a tunnel, a browser may see this server by https.
     own_host = hosts[0].strip().lower()
@@ -206,11 +228,16 @@ class Guard:
 
         headers = Headers(scope=scope)
         receive_limited = self._limited(receive)
-        send_guarded = self._guarded(scope, send)
+        send_guarded = self._guarded(scope, headers, send)
         try:
             admitted = scope
             if self.access is not None:
                 admitted = self.access.authorize(scope, headers)
+            if admitted.get(PREFLIGHT):
+                await Response(status_code=204, headers=PREFLIGHT_HEADERS)(
+                    scope, receive, send_guarded
+                )
+                return
             # A body that announces too large a size is refused before it comes.
             self._check_size(int(headers.get("content-length", 0)))
             await self.app(admitted, receive_limited, send_guarded)
@@ -245,15 +272,27 @@ class Guard:
 
         return receive_limited
 
-    def _guarded(self, scope: Scope, send: Send) -> Send:
-        """A `send` that adds the security headers to an answer, and logs the request `scope`.
+    def _guarded(self, scope: Scope, headers: Headers, send: Send) -> Send:
+        """A `send` that adds the security headers to an answer, and logs the request.
 
         It raises asyncio.TimeoutError if the client does not read the answer.
+
+        Args:
+            scope: the request.
+            headers: its headers.
+            send: takes the answer.
         """
+        # A browser shows the answer to a page of another site only if it names the site.
+        page_origin = None
+        if self.access is not None:
+            page_origin = self.access.public.admitted_origin(headers)
+        site_headers: dict[str, str] = {}
+        if page_origin is not None:
+            site_headers = {"Access-Control-Allow-Origin": page_origin, **PAGE_HEADERS}
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(SECURITY_HEADERS)
+                MutableHeaders(scope=message).update({**SECURITY_HEADERS, **site_headers})
                 self._log_request(scope, message["status"])
             await asyncio.wait_for(send(message), MAX_SEND_S)
 

@@ -12,6 +12,8 @@ from starlette.datastructures import Headers
 from spackle.runtime.errors import InputError
 
 NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9._-]*[a-z0-9])?")  # a host name in lower case
+# The origin of a page: scheme, host name in lower case, and perhaps a port.
+ORIGIN_PATTERN = re.compile(rf"https?://{NAME_PATTERN.pattern}(:\d{{1,5}})?")
 USUAL_PORTS = {"http": 80, "https": 443}  # which addresses leave out
 
 
@@ -28,6 +30,9 @@ class PublicAddress:
     url: str | None = None
     # Addresses or networks of proxies, whose X-Forwarded headers are believed.
     proxies: tuple[str, ...] = ()
+    # Origins of pages of other sites that may use the interface (CORS), such as
+    # "https://gallery.example.com". They need the token as any other client.
+    page_origins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """InputError for a value that cannot be used."""
@@ -39,6 +44,12 @@ class PublicAddress:
                 )
         if self.url is not None:
             self._check_url(self.url)
+        for origin in self.page_origins:
+            if not ORIGIN_PATTERN.fullmatch(origin.lower()):
+                raise InputError(
+                    f"`cors` {origin}: no origin of pages: give one such as "
+                    "https://gallery.example.com, without a path"
+                )
         for proxy in self.proxies:
             try:
                 ipaddress.ip_network(proxy)
@@ -89,6 +100,14 @@ class PublicAddress:
     def path(self) -> str:
         """The path of `url`, without a slash at its end: "/photos", or an empty text."""
         return "" if self.url is None else urlsplit(self.url).path.rstrip("/")
+
+    def admitted_origin(self, headers: Headers) -> str | None:
+        """The origin of the page of another site that asks, if it may use the interface."""
+        origins = headers.getlist("origin")
+        admitted = {origin.lower() for origin in self.page_origins}
+        if len(origins) == 1 and origins[0].strip().lower() in admitted:
+            return origins[0].strip()
+        return None
 
     def asked_hosts(self, headers: Headers, client: tuple[str, int] | None) -> list[str]:
         """The values of the header Host, as the client's browser sent it.
