@@ -25,7 +25,7 @@ OPTIONAL = (
     "yaml",
     "tensorboard",
 )
-OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision", "OpenEXR")
+OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision", "OpenEXR", "prometheus_client")
 
 # The rooms from the first to the last: a room imports only from itself and from rooms above it in
 # this list. "top" are the files of the pipeline beside the rooms.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -157,3 +158,42 @@ def test_pages_of_an_admitted_site_and_of_no_other_use_the_interface(tmp_path: P
     for bad in ("*", "gallery.example.com", "https://gallery.example.com/", "null"):
         with pytest.raises(InputError, match="cors"):
             PublicAddress(page_origins=(bad,))
+
+
+def test_prometheus_reads_numbers_of_photos_work_and_answers(tmp_path: Path) -> None:
+    parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
+    with served(tmp_path) as server:
+
+        def numbers() -> dict[tuple[str, ...], float]:
+            reply = server.ask("/metrics")
+            assert reply.headers["content-type"].startswith("text/plain; version=0.0.4")
+            families = parser.text_string_to_metric_families(reply.body.decode())
+            samples = [sample for family in families for sample in family.samples]
+            return {(each.name, *each.labels.values()): each.value for each in samples}
+
+        for name in ("a.png", "b.png", "bad.png"):
+            assert server.events(server.send(name=name).json["id"])[-1]["ended"]
+        assert Served(server.port).ask("/metrics").status == 401
+        server.raw(b"STRANGE / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        found = numbers()
+        assert found["spackle_scenes", "done"] == 2
+        assert found["spackle_scenes", "failed"] == 1
+        assert found["spackle_scenes", "queued"] == 0
+        assert found["spackle_work_seconds_count", "done"] == 2
+        assert found["spackle_work_seconds_sum", "done"] > 0
+        assert found["spackle_work_seconds_count", "failed"] == 1
+        assert found["spackle_http_answers_total", "POST", "202"] == 3
+        assert found["spackle_http_answers_total", "GET", "401"] == 1
+        assert found["spackle_http_answers_total", "other", "401"] == 1
+        assert found["spackle_queue_limit",] == 32
+        assert found["spackle_disk_free_bytes",] > 0
+        assert numbers()["spackle_http_answers_total", "GET", "200"] > 0
+
+
+def test_without_the_package_the_server_says_how_to_get_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    with served(tmp_path) as server:
+        reply = server.ask("/metrics")
+        assert (reply.status, "pip install" in reply.json["error"]) == (404, True)

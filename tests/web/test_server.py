@@ -99,7 +99,7 @@ def test_a_photo_becomes_a_scene(server: Served) -> None:
 def test_the_interface_is_described(server: Served) -> None:
     paths = server.ask("/api/v1/openapi.json").json["paths"]
     below = ("", "/{id}", "/{id}/events", "/{id}/files/{file}", "/{id}/fill", "/{id}/remove")
-    assert set(paths) == {*(f"{SCENES}{path}" for path in below), "/healthz", "/readyz"}
+    assert set(paths) == {*(f"{SCENES}{path}" for path in below), "/healthz", "/readyz", "/metrics"}
     docs = server.ask("/docs").body.decode()
     assert all(word in docs for word in ("DELETE", "keep_frame", "scene.spz", "mask", "cameras"))
     assert "http" not in docs.lower().replace(

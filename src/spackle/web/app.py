@@ -15,7 +15,13 @@ from typing import Annotated, Any, Literal, get_args
 import uvicorn
 from fastapi import FastAPI, Header, Query, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from fastapi.responses import (
+    FileResponse,
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    Response,
+)
 from fastapi.sse import EventSourceResponse
 from jinja2 import Template
 from pydantic import BaseModel, Field
@@ -49,6 +55,7 @@ from spackle.web.description import (
 )
 from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, STRANGER, Access, Guard
 from spackle.web.jobs import Job, Jobs, RequestKey, RetentionLimits, SceneState, age_key
+from spackle.web.metrics import Metrics
 from spackle.web.shared_videos import SharedVideo
 from spackle.web.uploads import (
     FILL_FORM,
@@ -171,7 +178,13 @@ def create_app(
     app.needs_token = access is not None and access.token is not None
     app.form_models = FORM_MODELS
     app.state.jobs = jobs
-    app.add_middleware(Guard, access=access, max_bytes=max_bytes)
+    metrics = open_metrics(jobs)
+    app.add_middleware(
+        Guard,
+        access=access,
+        max_bytes=max_bytes,
+        count_answer=None if metrics is None else metrics.count_answer,
+    )
 
     takes_photos = access is None or access.token is not None
     # `SceneWork` has a method that lists the bases, the networks for a photo's geometry. Another
@@ -181,7 +194,7 @@ def create_app(
     public_path = "" if access is None else access.public.path
     handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes, public_path, base_name)
     add_scene_routes(app, handlers)
-    add_status_routes(app, handlers)
+    add_status_routes(app, handlers, metrics)
     add_page_routes(app, handlers)
     return app
 
@@ -250,8 +263,33 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
     )
 
 
-def add_status_routes(app: FastAPI, handlers: SceneHandlers) -> None:
-    """Add what those who watch over the server ask for; strangers may, too."""
+def open_metrics(jobs: Jobs) -> Metrics | None:
+    """The numbers of a server for Prometheus; None if its package is not installed."""
+    try:
+        return Metrics(jobs)
+    except ModuleNotFoundError:
+        return None
+
+
+def add_status_routes(app: FastAPI, handlers: SceneHandlers, metrics: Metrics | None) -> None:
+    """Add what those who watch over the server ask for; all but the numbers also of strangers."""
+
+    async def get_metrics() -> Response:
+        """Numbers of photos, work and answers, in the text format of Prometheus."""
+        if metrics is None:
+            raise HTTPException(
+                404, "metrics: the package is missing: pip install 'spackle-nvs[metrics]'"
+            )
+        return await run_in_threadpool(metrics.answer)
+
+    app.add_api_route(
+        "/metrics",
+        get_metrics,
+        operation_id="get_metrics",
+        tags=["status"],
+        response_class=PlainTextResponse,
+        responses=refusals(404),
+    )
     details: dict[str, Any] = {"tags": ["status"], "openapi_extra": {"security": []}}
     app.add_api_route(
         "/healthz",

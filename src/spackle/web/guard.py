@@ -202,17 +202,25 @@ def check_same_site(
 class Guard:
     """Middleware that refuses or limits requests, and sets security headers in every answer."""
 
-    def __init__(self, app: ASGIApp, access: Access | None, max_bytes: int) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        access: Access | None,
+        max_bytes: int,
+        count_answer: Callable[[str, int], None] | None = None,
+    ) -> None:
         """Guard an app.
 
         Args:
             app: receives the requests that are admitted.
             access: the rules; None admits every request.
             max_bytes: size limit of a request's body.
+            count_answer: called with the method and status of each answer; None: nobody counts.
         """
         self.app = app
         self.access = access
         self.max_bytes = max_bytes
+        self.count_answer = count_answer
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, if it may be answered.
@@ -294,6 +302,8 @@ class Guard:
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message).update({**SECURITY_HEADERS, **site_headers})
                 self._log_request(scope, message["status"])
+                if self.count_answer is not None:
+                    self.count_answer(scope["method"], message["status"])
             await asyncio.wait_for(send(message), MAX_SEND_S)
 
         return send_guarded

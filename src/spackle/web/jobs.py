@@ -41,7 +41,15 @@ class RetentionLimits(NamedTuple):
     work_s: float | None = None  # seconds that the work on a photo may take; None: any time
 
 
+JobState = Literal["queued", "running", "done", "failed"]
 EditKind = Literal["fill", "remove"]
+
+
+class WorkTimes(NamedTuple):
+    """How many jobs have ended since the start of the server, and the seconds of work on them."""
+
+    jobs: int = 0
+    seconds: float = 0.0
 
 
 class Edit(NamedTuple):
@@ -65,7 +73,7 @@ class SceneState(BaseModel):
 
     id: str
     name: str
-    state: Literal["queued", "running", "done", "failed"] = "queued"
+    state: JobState = "queued"
     stage: str | None = Field(default=None, description="The stage in progress.")
     share: float | None = Field(
         default=None, description="Fraction of the stage that is done, 0 to 1, if known."
@@ -160,6 +168,7 @@ class Jobs:
         self._processes: list[TaskProcess] = []
         self._own_process = threading.local()  # the process of the calling thread
         self._process_of_job: dict[str, TaskProcess] = {}  # by the id of a running job
+        self.work_times = {"done": WorkTimes(), "failed": WorkTimes()}
         self._timed_out: set[str] = set()  # ids of running jobs that took too long
         # Each process that makes scenes has a number, which chooses its GPU. A single process, and
         # the one that adds files, have none: they use torch's default GPU.
@@ -426,6 +435,7 @@ class Jobs:
             self._process_of_job[id] = process
             job = self.by_id[id]
 
+        start = time.monotonic()
         try:
             # An earlier server may have been stopped in the middle of this job.
             shutil.rmtree(job.results, ignore_errors=True)
@@ -447,6 +457,11 @@ class Jobs:
             if id in self._timed_out:
                 self._timed_out.discard(id)
                 error = f"{job.name}: took longer than {self.limits.work_s:g} seconds, the limit"
+            if not self._is_closed.is_set() and id in self.by_id:
+                state = "failed" if error else "done"
+                former = self.work_times[state]
+                seconds = former.seconds + time.monotonic() - start
+                self.work_times[state] = WorkTimes(former.jobs + 1, seconds)
         if not self._is_closed.is_set():
             self._record_end(id, error)
 
