@@ -34,6 +34,8 @@ JOURNEYS = (
     "paper/evaluation/test_evaluate.py",
     "paper/training/test_direct_ft.py",
     "test_api.py",
+    "test_progress.py",
+    "test_suggestions.py",
     "bases/test_sharp.py",
     "bases/test_moge.py",
     "bases/test_lite.py",
