@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import itertools
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.browser import opened, settled
+from helpers.firefox import firefox, screen
 from helpers.scenes import box_before_wall
 from helpers.web_client import eventually
 
@@ -155,3 +157,25 @@ def test_a_tap_stops_the_motion_and_two_go_back_to_the_photo(phone: Any) -> None
     phone.touchscreen.tap(*place)
     phone.touchscreen.tap(*place)
     eventually(lambda: phone.evaluate(EYE) == [0, 0, 0])
+
+
+def test_firefox_opens_the_file_from_the_disk_and_moves_it(file: Path, tmp_path: Path) -> None:
+    program = shutil.which("firefox-esr") or shutil.which("firefox")
+    if program is None:
+        pytest.skip("no Firefox is installed: apt-get install firefox-esr")
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no screen in memory for Firefox: apt-get install xvfb")
+    with screen() as display, firefox(program, tmp_path, display) as window:
+        window.open(file.as_uri())
+        assert window.run("spackle.ready.then(() => document.title)") == "Our garden"
+        assert window.run("document.getElementById('caption').textContent") == CAPTION
+        colors = """spackle.picture(32, 24).then((url) => createImageBitmap(
+            new Blob([Uint8Array.from(atob(url.split(",")[1]), (c) => c.charCodeAt(0))])))
+            .then((image) => {
+              const context = new OffscreenCanvas(32, 24).getContext("2d");
+              context.drawImage(image, 0, 0);
+              return new Set(context.getImageData(0, 0, 32, 24).data).size;
+            })"""
+        assert window.run(colors) > 20  # a picture, not an empty canvas
+        window.run("spackle.setView('swipe', 0.2, 1)")
+        assert window.run(EYE)[0] > 0
