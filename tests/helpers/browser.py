@@ -50,3 +50,18 @@ def settled(page: Any, promise: str) -> None:
 def pixels(png: bytes) -> Tensor:
     """[H, W, 3] in 0..1."""
     return torch.from_numpy(np.array(Image.open(io.BytesIO(png)).convert("RGB"))).float() / 255
+
+
+def drag_moves_the_eye(page: Any) -> None:
+    """Drag from the middle of the picture to the left, as a hand does; the eye must go to the
+    right.
+    """
+    settled(page, "spackle.settled()")
+    frame = page.locator("#frame").bounding_box()
+    x, y = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
+    start = page.evaluate("spackle.pose().eye[0]")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 0.1 * frame["width"], y)
+    page.mouse.up()
+    assert page.evaluate("spackle.pose().eye[0]") > start

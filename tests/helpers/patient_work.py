@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
+import time
+from pathlib import Path
 from typing import Any
 
+from spackle.web.jobs import WARM_UP
 from spackle.web.work import SceneWork
 
 
@@ -17,3 +21,18 @@ class PatientWork(SceneWork):
             send_event({"stage": "complete", "done": 1, "total": 4})
             threading.Event().wait()
         super().__call__(task, send_event)
+
+
+@dataclasses.dataclass
+class SlowStart(SceneWork):
+    """`SceneWork` whose warm-up takes until a file exists."""
+
+    go_on: Path = Path()
+
+    def __call__(self, task: Any, send_event: Any) -> None:
+        """Do a task."""
+        if task == WARM_UP:
+            while not self.go_on.exists():
+                time.sleep(0.01)
+        else:
+            super().__call__(task, send_event)

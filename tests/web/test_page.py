@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import ROOT
-from helpers.browser import Opened, opened, pixels, settled
+from helpers.browser import Opened, drag_moves_the_eye, opened, pixels, settled
 from helpers.photos import metres, write_depth, write_pair
 from helpers.scenes import box_before_wall, psnr, random_harmonics
 from helpers.web_client import eventually, served
@@ -269,21 +269,6 @@ def test_the_whole_photo_and_every_control_has_room(page: Any, size: tuple[int, 
     photo = page.locator("#view").bounding_box()
     assert photo["width"] / photo["height"] == pytest.approx(64 / 48, rel=0.01)
     page.set_viewport_size(before)
-
-
-def drag_moves_the_eye(page: Any) -> None:
-    """Drag from the middle of the picture to the left, as a hand does; the eye must go to the
-    right.
-    """
-    settled(page, "spackle.settled()")
-    frame = page.locator("#frame").bounding_box()
-    x, y = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
-    start = page.evaluate("spackle.pose().eye[0]")
-    page.mouse.move(x, y)
-    page.mouse.down()
-    page.mouse.move(x - 0.1 * frame["width"], y)
-    page.mouse.up()
-    assert page.evaluate("spackle.pose().eye[0]") > start
 
 
 def test_a_photo_is_sent_to_the_server_watched_and_dragged(browser: Any, tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from helpers.systems import needs_posix_signals
 from helpers.web_client import PATIENCE_S, SCENES, Served, eventually
 
 import spackle
-from spackle.bases.settings import ROUGH_GEOMETRY_ADVICE
 from spackle.formats import save_ply
+from spackle.web.work import ROUGH_DEPTH_NOTE
 
 
 def served_at(url: str) -> tuple[Served, str]:
@@ -152,7 +152,7 @@ def test_a_photo_is_completed_as_predict_completes_it(
     assert [page["note"] for page in seen] == [
         "",
         "",
-        ROUGH_GEOMETRY_ADVICE,
+        ROUGH_DEPTH_NOTE,
     ]  # by lite, which stays near
     assert seen[2]["orbit"]["free"] <= 0.15
     first, other = (

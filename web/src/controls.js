@@ -48,8 +48,16 @@ export function control(canvas, viewer) {
     "-": () => viewer.zoomAt(1 / 1.15, 0, 0),
     "0": () => viewer.home(),
     Home: () => viewer.home(),
-    " ": () => (viewer.playing ? viewer.pause() : viewer.play()),
   };
+
+  // Space plays from anywhere, but where it types, or presses what has the focus.
+  addEventListener("keydown", (event) => {
+    const isTaken = event.target.closest?.("button, summary, select, textarea, a, input:not([type=range])");
+    if (event.key !== " " || isTaken || canvas.inert || !viewer.description || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    if (viewer.playing) viewer.pause();
+    else viewer.play();
+  });
 
   function nudge(dx, dy) {
     viewer.pull(dx, dy);

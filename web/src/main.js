@@ -1,16 +1,20 @@
 // Starts the page: finds a scene, shows it, and takes further photos where there is a server.
+import { offerBetter } from "./better.js";
 import { control } from "./controls.js";
 import { cameraAt, Edits } from "./edits.js";
 import { gift, title } from "./gift.js";
-import { divider, fit, panel, roomy, unfold } from "./panel.js";
+import { divider, fit, name, panel, roomy, unfold } from "./panel.js";
 import { Queue } from "./queue.js";
 import { sharing } from "./share.js";
 import * as source from "./source.js";
 import { KINDS, Viewer } from "./viewer.js";
 import { eyeOnPath, lookingAxes } from "./views.js";
 
+// What is said of a stage of the work; of all others nothing but that there is work.
 const STAGES = {
-  load: "Loading", prepare: "Reading the depth map", base: "Finding depth", complete: "Filling what the photo hides",
+  "warm-up": "First photo: preparing, about half a minute",
+  load: "Loading", prepare: "Reading the depth map", base: "Finding depth", move: "Finding how far you can move",
+  complete: "Filling what the photo hides",
   "fill-seen": "Filling the holes that you have seen", remove: "Taking it out", patch: "Filling what it hid",
   write: "Almost there", measure: "Almost there", page: "Almost there",
 };
@@ -59,11 +63,26 @@ async function first() {
   element("open").hidden = !upload;
   edits.allowed = Boolean(upload);
   if (upload) element("file").accept = ["image/*", ...upload.suffixes].join(",");
-  const bases = (upload?.bases ?? []).map((name) => new Option(BASES[name] ?? name, name));
-  element("choices").querySelector("[name=base]").replaceChildren(...bases);
+  offerBases();
+  offerBetter(element("better"), upload?.better_depth, { say, done: useBetter });
   addEventListener("hashchange", () => chosen() && chosen() !== viewer.id && visit(chosen()));
   for (const button of document.querySelectorAll("[data-example]")) button.firstChild.src = source.here(`/${button.dataset.example}`);
   return chosen() ? visit(chosen()) : start();
+}
+
+function offerBases() {
+  const bases = (upload?.bases ?? []).map((name) => new Option(BASES[name] ?? name, name));
+  element("choices").querySelector("[name=base]").replaceChildren(...bases);
+}
+
+/** A better network is here: use it, at once for the photo that is shown. */
+async function useBetter() {
+  ({ upload } = await source.current());
+  offerBases();
+  const item = queue.withId(viewer.id);
+  if (!item?.file) return say("Better depth is here, for the photos that you add next.");
+  say("Better depth is here: your photo is done again.");
+  take([item.file]);
 }
 
 /** The page without a scene. */
@@ -80,6 +99,7 @@ function chosen() {
 
 async function show({ description, layers }, id = null) {
   viewer.show(description, layers, id);
+  name(description);
   element("name").textContent = description.name;
   document.title = `${description.name} · Spackle`;
   element("frame").hidden = false;
@@ -236,7 +256,7 @@ function stand(item) {
     item.url = source.file(item.id, "photo.jpg");
     stand(item);
   };
-  photo.src = url;
+  Object.assign(photo, { src: url, alt: `${item.name}, until its scene is ready`, ariaHidden: null });
 }
 
 /** Queue photos; what the options say holds for them. */
@@ -331,7 +351,7 @@ function notice(title, text, busy = false) {
 
 /** `share` in 0..1, or null where nobody knows. */
 function progress(stage, share) {
-  notice(STAGES[stage] ?? stage ?? "Working on your photo", "", true);
+  notice(STAGES[stage] ?? "Working on your photo", "", true);
   const bar = element("notice").querySelector("progress");
   if (share === null) bar.removeAttribute("value");
   else bar.value = share;
@@ -385,8 +405,10 @@ function scripting(ready) {
     forget: () => (edits.seen.eyes = []),
     /** Eye [x, y, z] in metres at t in 0..1 of a path. */
     eye: (kind, disparity, t) => eyeOnPath(viewer.description, kind, disparity, t),
-    /** Where the eye is, and the rows right, down, forward of the camera's rotation. */
-    pose: () => ({ eye: viewer.stage.eye, axes: lookingAxes(viewer.stage.eye, viewer.description.focus) }),
+    /** Where the eye is, the rows right, down, forward of the camera's rotation, and the zoom {scale, x, y}. */
+    pose: () => ({
+      eye: viewer.stage.eye, axes: lookingAxes(viewer.stage.eye, viewer.description.focus), zoom: { ...viewer.stage.zoom },
+    }),
     setView: (kind, disparity, t) => drawn(() => viewer.setView(kind, disparity, t)),
     setLayers: (layers) => drawn(() => viewer.setLayers(layers)), // base, aux or both
     setHeat: (on) => drawn(() => viewer.setHeat(on)),

@@ -2,6 +2,11 @@
 import { recorder, saveFile, savePicture } from "./save.js";
 
 const ROOM = 230; // pixels beside the picture in which the controls may stay unfolded
+// What is called how, in a scene of a photo and in one that another program made.
+const WORDS = {
+  photo: { base: "What the photo shows", left: "The photo alone", heat: "Holes: what the photo does not show", legend: "not in the photo" },
+  scene: { base: "The scene as it was", left: "As it was", heat: "Holes: where the scene was empty", legend: "empty before" },
+};
 const element = (id) => document.getElementById(id);
 
 export function panel(viewer, say) {
@@ -53,7 +58,6 @@ export function panel(viewer, say) {
 
   viewer.addEventListener("change", update);
   viewer.addEventListener("turn", () => !viewer.onPath || showDisparity());
-  viewer.addEventListener("drawn", facts);
   new ResizeObserver(() => element("frame").classList.contains("waiting") || fit(viewer)).observe(element("area"));
 
   function update() {
@@ -77,20 +81,35 @@ export function panel(viewer, say) {
   function showDisparity() {
     slider.max = viewer.description.orbit.limit;
     if (document.activeElement !== slider || !viewer.onPath) slider.value = viewer.disparity;
-    const shown = viewer.disparity.toFixed(2);
     slider.style.setProperty("--at", `${(100 * viewer.disparity) / slider.max}%`);
-    slider.setAttribute("aria-valuetext", `move ${shown}`);
+    const shown = distance(viewer);
+    slider.setAttribute("aria-valuetext", shown);
+    slider.parentElement.title = `How far you move to the side: a disparity of ${viewer.disparity.toFixed(2)} (0.3 is large)`;
     document.querySelector("output[for=disparity]").value = shown;
   }
+}
 
-  function facts() {
-    const { layers: all, note } = viewer.description;
-    const count = all.reduce((sum, layer) => sum + layer.count, 0);
-    const caution = note ? ` · ${note.split(";")[0]}` : "";
-    const speed = viewer.playing && viewer.fps ? ` · ${viewer.fps.toFixed(viewer.fps < 10 ? 1 : 0)} fps` : "";
-    const text = `${count.toLocaleString("en")} Gaussians${caution}${speed}`;
-    if (element("facts").textContent !== text) Object.assign(element("facts"), { textContent: text, title: note ?? "" });
-  }
+/** How far the eye moves to the side, in words: a length where the scene has one, else how far the nearest thing shifts. */
+function distance({ description, disparity }) {
+  if (!description.isMetric) return `${Math.round(100 * disparity)} %`;
+  const metres = (disparity * description.orbit.unit) / (description.lengthFactor ?? 1);
+  if (metres >= 1) return `${metres.toFixed(1)} m`;
+  return `${(100 * metres).toFixed(metres < 0.1 ? 1 : 0)} cm`;
+}
+
+/** Name the layers, the divider and the holes as it suits a scene. */
+export function name(description) {
+  const words = WORDS[description.isPhoto ? "photo" : "scene"];
+  document.querySelector("[data-layers=base]").textContent = words.base;
+  document.querySelector(".tag.left").textContent = words.left;
+  element("legend").lastChild.textContent = words.legend;
+  element("heat").title = words.heat;
+  element("divider").setAttribute("aria-label", `${words.left} to the left of this line, the completed scene to the right`);
+  // What a person should know of the scene's quality; the whole note as a hint.
+  Object.assign(element("facts"), { textContent: description.note?.split(";")[0] ?? "", title: description.note ?? "" });
+  element("view").setAttribute("aria-label", `The scene ${description.name}`);
+  // The canvas shows now what the picture showed.
+  Object.assign(element("photo"), { alt: "", ariaHidden: "true" });
 }
 
 /** Show all controls where a small screen hides them, or hide them again. */

@@ -23,6 +23,16 @@ export async function current() {
   return (await answer(await fetch(here("/page.json"), { cache: "no-store" }))).json();
 }
 
+/** How far the download of a better network is: {bytes, licence, state, share, error}. */
+export async function better() {
+  return (await answer(await fetch(here("/better-depth"), { cache: "no-store" }))).json();
+}
+
+/** Have the server begin this download. */
+export async function fetchBetter() {
+  return (await answer(await fetch(here("/better-depth"), { method: "POST" }))).json();
+}
+
 /** How far a scene is, and the `files` that are there. */
 export async function state(id) {
   return (await answer(await fetch(here(`${SCENES}/${id}`)))).json();

@@ -38,8 +38,6 @@ export class Viewer extends EventTarget {
     this.home();
     this.clock = null; // the path begins anew, and far from here
     this.glideSeconds = FIRST_GLIDE_S;
-    this.disparity = Math.min(USUAL, description.orbit.free);
-    this.changed();
   }
 
   /** Another state of the same scene; everything else stays as it is. */
@@ -186,9 +184,10 @@ export class Viewer extends EventTarget {
     this.changed();
   }
 
-  /** The photo's own view. */
+  /** The photo's own view, and the usual range of a path. */
   home() {
     this.stage.eye = [0, 0, 0];
+    this.disparity = Math.min(USUAL, this.description.orbit.free);
     Object.assign(this.stage.zoom, { scale: 1, x: 0, y: 0 });
     Object.assign(this, { onPath: false, playing: false, pulled: null });
     this.changed();

@@ -262,10 +262,13 @@ def check_pixel_count(
         max_pixels = min(MAX_PIXELS, max(HARMLESS_PIXELS, MAX_PIXELS_PER_BYTE * file_bytes))
 
     if width * height > max_pixels:
-        limit = f"at most {max_pixels // 10**6} megapixels"
-        if file_bytes is not None:
-            limit += f" in {file_bytes:,} bytes"
-        raise InputError(f"{path}: {width}×{height} is too large ({limit}): shrink the image first")
+        size = f"{width * height / 1e6:.0f} megapixels ({width}×{height})"
+        # Even a large file may not have more than `MAX_PIXELS`, so its size does not matter then.
+        if width * height > MAX_PIXELS:
+            limit = f"at most {MAX_PIXELS // 10**6}"
+        else:
+            limit = f"at most {max_pixels // 10**6} in a file of {file_bytes:,} bytes"
+        raise InputError(f"{path}: {size} are too large ({limit}): shrink the image first")
 
 
 def upright(image: Image.Image) -> Image.Image:

@@ -72,7 +72,7 @@ MIN_LOG_SCALE_RANGE = 1e-3
 GAUSSIANS_PER_BLOCK = 1 << 16
 
 # The items of a description that say how the page's camera looks and moves.
-VIEWING_ITEMS = ("camera", "focus", "zNear", "orbit", "paths")
+VIEWING_ITEMS = ("camera", "focus", "zNear", "orbit", "paths", "isMetric", "isPhoto")
 
 # The places in the page where the title, the icon, the photo, the style and the script are put.
 TITLE_TAG = "<title>Spackle</title>"
@@ -183,12 +183,17 @@ def page_scene(
         # Both are equal, because the scene can be shown everywhere within the limit.
         "orbit": {"unit": metres_per_disparity, "free": limit, "limit": limit},
         "paths": {kind: _path_positions(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
+        # Whether a length can be said in metres: lengths here are the scene's times `lengthFactor`.
+        "isMetric": is_metric,
+        # Whether Spackle completed a photo; another program's scene does not say for which range.
+        "isPhoto": disparity is not None,
         "layers": layers,
     }
     if length_factor != 1:  # the server's scene has the unit of its file
         description["lengthFactor"] = length_factor
     if viewed_as is not None:
-        description |= {item: viewed_as[item] for item in VIEWING_ITEMS}
+        # A description that an older server wrote may lack some.
+        description |= {item: viewed_as[item] for item in VIEWING_ITEMS if item in viewed_as}
     return PageScene(description, files)
 
 

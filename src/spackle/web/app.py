@@ -36,6 +36,7 @@ from spackle.core.image_formats import PHOTO_SUFFIXES
 from spackle.formats.html import read_page_file
 from spackle.runtime.errors import InputError, printable_line
 from spackle.runtime.task_process import TaskFunction
+from spackle.web.better_depth import BetterDepth, FetchState
 from spackle.web.callbacks import CallbackSender
 from spackle.web.description import (
     ACCEPTED,
@@ -56,6 +57,7 @@ from spackle.web.description import (
 from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, STRANGER, Access, Guard
 from spackle.web.jobs import Job, Jobs, RequestKey, RetentionLimits, SceneState, age_key
 from spackle.web.metrics import Metrics
+from spackle.web.public_address import LOCAL_ONLY
 from spackle.web.shared_videos import SharedVideo
 from spackle.web.uploads import (
     FILL_FORM,
@@ -190,9 +192,16 @@ def create_app(
     # `SceneWork` has a method that lists the bases, the networks for a photo's geometry. Another
     # function as `work` has none; clients can then only choose AUTO.
     list_bases = getattr(work, "bases", lambda: [AUTO])
+    # Only a person at this machine may have something installed on it, nobody behind a proxy.
+    better_depth = None
+    is_private = access is not None and access.local and access.public == LOCAL_ONLY
+    if takes_photos and is_private:
+        better_depth = BetterDepth()
     base_name = work.base.name if isinstance(work, SceneWork) else None
     public_path = "" if access is None else access.public.path
-    handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes, public_path, base_name)
+    handlers = SceneHandlers(
+        jobs, list_bases, takes_photos, max_bytes, public_path, base_name, better_depth
+    )
     add_scene_routes(app, handlers)
     add_status_routes(app, handlers, metrics)
     add_page_routes(app, handlers)
@@ -325,6 +334,12 @@ def add_page_routes(app: FastAPI, handlers: SceneHandlers) -> None:
 
     # These routes serve the page and are no part of the interface for programs.
     app.add_api_route("/page.json", handlers.get_page_state, include_in_schema=False)
+    if handlers.better_depth is not None:
+        for method, handler in (
+            ("GET", handlers.get_better_depth),
+            ("POST", handlers.post_better_depth),
+        ):
+            app.add_api_route("/better-depth", handler, methods=[method], include_in_schema=False)
     for path in ("/docs", DOCS_PATH):
         app.add_api_route(path, get_docs, include_in_schema=False)
     # The last route, because it takes every other path.
@@ -342,6 +357,7 @@ class SceneHandlers:
         max_bytes: int,
         public_path: str,
         base_name: str | None,
+        better_depth: BetterDepth | None = None,
     ) -> None:
         """Prepare to answer requests.
 
@@ -353,7 +369,9 @@ class SceneHandlers:
             max_bytes: size limit of an upload.
             public_path: the part of an address's path that a proxy takes away, such as "/photos".
             base_name: the name of the base of photos whose clients choose none, if known.
+            better_depth: fetches a better network when the page asks for it; None if nobody may.
         """
+        self.better_depth = better_depth
         self.jobs = jobs
         self.list_bases = list_bases
         self.takes_photos = takes_photos
@@ -553,8 +571,19 @@ class SceneHandlers:
                 "suffixes": PHOTO_SUFFIXES,
                 "max_bytes": self.max_bytes,
                 "bases": self.list_bases(),
+                "better_depth": self.better_depth and self.better_depth.offer(),
             }
         }
+
+    async def get_better_depth(self) -> FetchState:
+        """How far the download of a better network's weights is."""
+        assert self.better_depth is not None  # else there is no such route
+        return self.better_depth.state()
+
+    async def post_better_depth(self) -> FetchState:
+        """Begin to fetch a better network's weights onto this machine."""
+        assert self.better_depth is not None  # else there is no such route
+        return self.better_depth.start()
 
     async def get_health(self, request: Request) -> Health:
         """Whether the server runs; with the token also its version and its base."""

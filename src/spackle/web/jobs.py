@@ -29,6 +29,8 @@ RECORD_FILE = "job.json"  # stores the state of a job, in the folder of the job
 UPLOAD_PREFIX = ".new-"  # begins the names of folders of incomplete uploads
 RETRY_AFTER_S = 10  # seconds after which a client may try again if the queue was full
 MIN_FREE_BYTES = 200_000_000  # that a photo with its results may take
+# The task of a process that prepares for its first photo, and the stage of photos that wait for it.
+WARM_UP = "warm-up"
 TIDY_INTERVAL_S = 60.0  # seconds between two searches for results that are too old
 
 
@@ -164,6 +166,7 @@ class Jobs:
         self._queue: list[str] = []  # ids of the jobs that wait, the next one first
         self._lock = threading.RLock()  # of `by_id`, of the queue, and of the processes
         self._is_closed = threading.Event()
+        self._is_warming_up = False
         self._work = work
         self._processes: list[TaskProcess] = []
         self._own_process = threading.local()  # the process of the calling thread
@@ -280,6 +283,29 @@ class Jobs:
                 with contextlib.suppress(InputError, OSError):
                     self.by_id[id].save()
 
+    def warm_up(self) -> None:
+        """Have a process prepare for its first photo, if its work can do that; returns at once.
+
+        The work is then called with the task `WARM_UP`. Photos that come meanwhile wait, and their
+        state says so.
+        """
+        if getattr(self._work, "prepares_for_photos", False):
+            self._is_warming_up = True
+            self._scene_threads.submit(self._warm_up)
+
+    def _warm_up(self) -> None:
+        """Do the task `WARM_UP` in the process of the calling thread."""
+
+        def ignore_event(event: TaskEvent) -> None:
+            """Nobody waits for this work yet."""
+
+        try:
+            # What goes wrong here goes wrong again with the first photo, whose sender is told.
+            error = self._process().do(WARM_UP, ignore_event)
+            LOG.debug("prepared for the first photo: %s", error or "done")
+        finally:
+            self._is_warming_up = False
+
     def _change(self, id: str, **values: object) -> None:
         """Set fields of the state of a job, unless `remove` has deleted the job."""
         with self._lock:
@@ -351,6 +377,8 @@ class Jobs:
         if key is not None:
             job = job.model_copy(update=key._asdict())
         job.save()
+        if self._is_warming_up:
+            job = job.model_copy(update={"stage": WARM_UP})
         # `reserve_place` counts folders and jobs, so the two change together.
         with self._lock:
             job_folder = folder.rename(self.folder / id)
@@ -431,7 +459,7 @@ class Jobs:
             self._dequeue(id)
             if self._is_closed.is_set() or id not in self.by_id:
                 return
-            self._change(id, state="running")
+            self._change(id, state="running", stage=None)
             self._process_of_job[id] = process
             job = self.by_id[id]
 

@@ -127,9 +127,15 @@ def show_page(
         ) as (jobs, urls),
     ):
         # The page shows the scene whose id follows the # in its address.
+        # A scene is shown at once; all else needs what the warm-up prepares.
+        is_scene = target is not None and scene_suffix(target) is not None
+        if not is_scene:
+            jobs.warm_up()
         if target is not None:
             job_id = _add_target(jobs, target, title, options)
             urls = [f"{url}#{job_id}" for url in urls]
+        if is_scene:
+            jobs.warm_up()
         announce(title, urls, address, reporter, opens_browser=options.opens_browser)
 
 
@@ -215,7 +221,10 @@ def serve_programs(
     work.base.check()
     if workers is None:
         workers = gpu_worker_count(work.base.device)
-    with run_server(folder, work, workers, limits, address, reporter) as (_, urls):
+    with run_server(folder, work, workers, limits, address, reporter) as (jobs, urls):
+        # Photos that an earlier server left unfinished come first, and prepare the process.
+        if all(job.ended is not None for job in jobs.by_id.values()):
+            jobs.warm_up()
         reporter.log(
             f"token: {address.token} (send it as `Authorization: Bearer TOKEN`, "
             "or use the address, which has it)"

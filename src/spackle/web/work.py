@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
 from spackle.bases.lite import LiteBase
-from spackle.bases.settings import AUTO, ROUGH_GEOMETRY_ADVICE, BaseSettings
+from spackle.bases.settings import AUTO, BaseSettings
 from spackle.core.color import to_uint8
 from spackle.core.image_files import OpenPicture, read_picture
 from spackle.core.photo import check_photo_size, refuse_if_not_flat
@@ -42,7 +44,7 @@ from spackle.web.edits import (
     remove_and_patch,
     sent_mask,
 )
-from spackle.web.jobs import Job
+from spackle.web.jobs import WARM_UP, Job
 from spackle.web.shared_videos import SharedVideo, shared_video_options
 
 Download = Literal[
@@ -76,6 +78,9 @@ DEFAULT_FILES: list[FileName] = [
 SCENE_FILE = "scene.ply"  # the scene, of which all other files are made
 PAGE = "page.json"  # what the page draws, without the Gaussians
 PREVIEW = "photo.jpg"  # the small photo that the page shows until the scene is ready
+# What the page says of a scene whose depth a small network has guessed.
+ROUGH_DEPTH_NOTE = "Rough depth: a quick guess."
+WARM_UP_SIDE_PX = 64  # pixels of the picture with which a process prepares
 PREVIEW_SIDE_PX = 1280  # pixels of the preview's long side
 
 
@@ -141,6 +146,9 @@ class SceneWork:
     default_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     verbose: bool = False  # whether to report details
     pipeline: Pipeline | None = None  # with the base that was used last
+    # Its files of weights: with "auto", others may come to this machine meanwhile.
+    pipeline_files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    prepares_for_photos: ClassVar[bool] = True  # takes the task `WARM_UP`
 
     def bases(self) -> list[str]:
         """The names of the bases that a client may choose, without duplicates.
@@ -150,18 +158,22 @@ class SceneWork:
         names = [self.base.name, AUTO, *BaseSettings().model_files]
         return list(dict.fromkeys(names))
 
-    def __call__(self, task: tuple[Job, str | None], send_event: SendEvent) -> None:
+    def __call__(self, task: tuple[Job, str | None] | str, send_event: SendEvent) -> None:
         """Do a task: make the scene of a job's photo, or add a file to the job's finished scene.
 
         Args:
             task: the job, and the name of the file to add; None: make the scene, and the files that
-                the job's options name.
+                the job's options name. Or `WARM_UP`: prepare for the first photo.
             send_event: takes progress and log lines for the server.
 
         Raises:
             InputError: the photo, depth map or scene is unusable. The message has no path of this
                 server.
         """
+        if isinstance(task, str):
+            assert task == WARM_UP, task
+            self._warm_up()
+            return
         job, file = task
         # What the client has set goes before the server's defaults.
         options = SceneOptions.model_validate({**self.default_options, **job.options})
@@ -249,11 +261,7 @@ class SceneWork:
         pipeline_options = PipelineOptions(
             base=settings, path=path, fill=FillOptions(fill=options.fill)
         )
-        if self.pipeline is None or self.pipeline.options.base != settings:
-            # The old network is freed before another one is loaded: both may not fit into memory.
-            self.pipeline = None
-            self.pipeline = Pipeline.open(pipeline_options)
-        pipeline = dataclasses.replace(self.pipeline, options=pipeline_options)
+        pipeline = dataclasses.replace(self._opened(pipeline_options), options=pipeline_options)
 
         photo_options = PhotoOptions(
             lens=options.model_dump(include={"focal_px", "focal_mm", "fov"}),
@@ -263,7 +271,39 @@ class SceneWork:
         photo = job.folder / job.source
         report = predict_photo(photo, job.results, pipeline, reporter, photo_options)
         # Without depth and without the weights of a better network, a small network guesses.
-        return ROUGH_GEOMETRY_ADVICE if report.run.base == LiteBase.name else ""
+        return ROUGH_DEPTH_NOTE if report.run.base == LiteBase.name else ""
+
+    def _opened(self, options: PipelineOptions) -> Pipeline:
+        """The pipeline with the base that the options name; opened now, if it is not open yet."""
+        settings = options.base
+        files = settings.model_files
+        is_open = self.pipeline is not None and self.pipeline.options.base == settings
+        if self.pipeline is None or not is_open or files != self.pipeline_files:
+            # The old network is freed before another one is loaded: both may not fit into memory.
+            self.pipeline = None
+            self.pipeline = Pipeline.open(options)
+            self.pipeline_files = files
+        return self.pipeline
+
+    def _warm_up(self) -> None:
+        """Compile the kernels, and load the base: the first photo then need not wait for them."""
+        reporter = Reporter(False, Console(quiet=True, force_terminal=False))
+        quick = dataclasses.replace(self.base, name=LiteBase.name, checkpoint=None)
+        options = PipelineOptions(base=quick, path=PathOptions(), fill=FillOptions())
+        with tempfile.TemporaryDirectory(prefix="spackle-warm-up-") as folder:
+            # Dark to the left, bright to the right, with a square that stands out: there are edges,
+            # and holes behind them.
+            side = WARM_UP_SIDE_PX
+            picture = np.tile(np.linspace(40, 200, side), (side, 1))
+            picture[side // 3 : -side // 3, side // 3 : -side // 3] = 255
+            photo = Path(folder) / "photo.png"
+            Image.fromarray(picture.astype(np.uint8)).convert("RGB").save(photo)
+            photo_options = PhotoOptions(lens={}, render=False)
+            predict_photo(
+                photo, Path(folder) / "results", Pipeline.open(options), reporter, photo_options
+            )
+            Scene.load(Path(folder) / "results" / SCENE_FILE).page("photo")
+        self._opened(PipelineOptions(base=self.base, path=PathOptions(), fill=FillOptions()))
 
     def _base_settings(self, job: Job, options: SceneOptions) -> BaseSettings:
         """The settings of the base, which turns a photo into Gaussians.
