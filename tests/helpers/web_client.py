@@ -22,6 +22,7 @@ from helpers import web_work
 from helpers.photos import picture
 from spackle.web.app import create_app, make_server
 from spackle.web.callbacks import CallbackSender
+from spackle.web.clients import Client
 from spackle.web.guard import Access
 from spackle.web.jobs import Jobs, RetentionLimits
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
@@ -121,6 +122,7 @@ def served(
     keep: RetentionLimits = RetentionLimits(),  # noqa: B008
     public: PublicAddress = LOCAL_ONLY,
     callbacks: CallbackSender | None = None,
+    clients: tuple[Client, ...] = (),
 ) -> Iterator[Served]:
     with socket.socket() as listener:
         listener.bind((host, 0))
@@ -130,7 +132,7 @@ def served(
             folder,
             work,
             keep=keep,
-            access=Access.for_listener(host, address, token, public),
+            access=Access.for_listener(host, address, token, public, clients),
             max_bytes=max_bytes,
             callbacks=callbacks,
         )

@@ -70,7 +70,7 @@ def receiver() -> Iterator[Receiver]:
 @contextlib.contextmanager
 def calling(folder: Path, receiver: Receiver) -> Iterator[Served]:
     """A server that may call the receiver."""
-    with served(folder, callbacks=CallbackSender((receiver.url,), TOKEN)) as server:
+    with served(folder, callbacks=CallbackSender((receiver.url,), {"": TOKEN})) as server:
         yield server
 
 
@@ -167,7 +167,7 @@ def test_a_message_that_did_not_arrive_is_sent_after_a_restart(
     ],
 )
 def test_only_named_hosts_are_called(tmp_path: Path, receiver: Receiver, url: str) -> None:
-    sender = CallbackSender((receiver.url,), TOKEN)
+    sender = CallbackSender((receiver.url,), {"": TOKEN})
     port = receiver.url.rpartition(":")[2]
     with pytest.raises(Exception, match="callback_url") as refusal:
         sender.check(url.replace("{port}", port))
@@ -186,6 +186,6 @@ def test_a_server_that_may_call_nobody_refuses(tmp_path: Path) -> None:
 @pytest.mark.parametrize("host", ["*", "ftp://a.example", "a.example/path", "", "a.example:port"])
 def test_a_host_that_is_none_is_refused(tmp_path: Path, host: str) -> None:
     with pytest.raises(InputError, match="`callback_host`"):
-        CallbackSender((host,), TOKEN)
+        CallbackSender((host,), {"": TOKEN})
     if host == "*":
         refuses(run("serve", "-o", tmp_path, "--callback-host", host), "--callback-host *")

@@ -34,6 +34,14 @@ def serve(
             envvar="SPACKLE_TOKEN",
         ),
     ] = None,
+    clients: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="YAML file of more tokens, each with a name, a limit and scenes of its own; see "
+            "docs/http.md.",
+        ),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -124,6 +132,7 @@ def serve(
     # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
+    from spackle.web.clients import read_clients
     from spackle.web.jobs import RetentionLimits
     from spackle.web.local_server import ServerAddress, serve_programs
     from spackle.web.public_address import PublicAddress
@@ -147,6 +156,7 @@ def serve(
                 proxies=tuple(proxy or ()),
                 page_origins=tuple(cors or ()),
             ),
+            clients=() if clients is None else read_clients(clients),
             callback_hosts=tuple(callback_host or ()),
         ),
         CommandReporter(verbose, as_json=as_json),

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, get_args
 
 import uvicorn
-from fastapi import FastAPI, Header, Query, Request
+from fastapi import Depends, FastAPI, Header, Query, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import (
     FileResponse,
@@ -38,6 +38,7 @@ from spackle.runtime.errors import InputError, printable_line
 from spackle.runtime.task_process import TaskFunction
 from spackle.web.better_depth import BetterDepth, FetchState
 from spackle.web.callbacks import CallbackSender
+from spackle.web.clients import OPERATOR, RateLimits, client_of, may_use
 from spackle.web.description import (
     ACCEPTED,
     ANY_FORM,
@@ -192,15 +193,19 @@ def create_app(
     # `SceneWork` has a method that lists the bases, the networks for a photo's geometry. Another
     # function as `work` has none; clients can then only choose AUTO.
     list_bases = getattr(work, "bases", lambda: [AUTO])
-    # Only a person at this machine may have something installed on it, nobody behind a proxy.
+    # Only a person at this machine may have something installed on it, nobody behind a proxy and no
+    # client with a token of its own.
     better_depth = None
-    is_private = access is not None and access.local and access.public == LOCAL_ONLY
+    is_private = (
+        access is not None and access.local and access.public == LOCAL_ONLY and not access.clients
+    )
     if takes_photos and is_private:
         better_depth = BetterDepth()
     base_name = work.base.name if isinstance(work, SceneWork) else None
     public_path = "" if access is None else access.public.path
+    rates = RateLimits(() if access is None else access.clients)
     handlers = SceneHandlers(
-        jobs, list_bases, takes_photos, max_bytes, public_path, base_name, better_depth
+        jobs, list_bases, takes_photos, max_bytes, public_path, base_name, rates, better_depth
     )
     add_scene_routes(app, handlers)
     add_status_routes(app, handlers, metrics)
@@ -220,6 +225,8 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
             methods=[method],
             operation_id=handler.__name__,
             tags=["scenes"],
+            # A client with a token of its own sees and changes its own scenes alone.
+            dependencies=[Depends(handlers.check_owner)] if "{id}" in path else [],
             **details,
         )
 
@@ -261,7 +268,7 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
         one_scene + "/events",
         handlers.get_events,
         response_class=EventSourceResponse,
-        responses=refusals(),
+        responses=refusals(404),
     )
     add(
         "GET",
@@ -283,8 +290,11 @@ def open_metrics(jobs: Jobs) -> Metrics | None:
 def add_status_routes(app: FastAPI, handlers: SceneHandlers, metrics: Metrics | None) -> None:
     """Add what those who watch over the server ask for; all but the numbers also of strangers."""
 
-    async def get_metrics() -> Response:
+    async def get_metrics(request: Request) -> Response:
         """Numbers of photos, work and answers, in the text format of Prometheus."""
+        # The numbers are sums over all clients.
+        if client_of(request.scope) != OPERATOR:
+            raise HTTPException(403, "the numbers need the server's own token")
         if metrics is None:
             raise HTTPException(
                 404, "metrics: the package is missing: pip install 'spackle-nvs[metrics]'"
@@ -357,6 +367,7 @@ class SceneHandlers:
         max_bytes: int,
         public_path: str,
         base_name: str | None,
+        rates: RateLimits,
         better_depth: BetterDepth | None = None,
     ) -> None:
         """Prepare to answer requests.
@@ -369,6 +380,7 @@ class SceneHandlers:
             max_bytes: size limit of an upload.
             public_path: the part of an address's path that a proxy takes away, such as "/photos".
             base_name: the name of the base of photos whose clients choose none, if known.
+            rates: limits how many photos a client may send.
             better_depth: fetches a better network when the page asks for it; None if nobody may.
         """
         self.better_depth = better_depth
@@ -378,7 +390,9 @@ class SceneHandlers:
         self.max_bytes = max_bytes
         self.public_path = public_path
         self.base_name = base_name
-        self.keys_in_progress: set[str] = set()  # Idempotency-Keys of requests that still arrive
+        self.rates = rates
+        # Clients and Idempotency-Keys of requests that still arrive.
+        self.keys_in_progress: set[tuple[str, str]] = set()
         # One photo is decoded at a time: decoding a large one takes a gigabyte of memory.
         self.decoding = asyncio.Lock()
 
@@ -426,11 +440,12 @@ class SceneHandlers:
             request: the request, with the form.
             response: gets the address of the job's state.
             idempotency_key: what the client calls its request, or None.
-            accept: takes the form, a folder for its files, `jobs`, and the key.
+            accept: takes the form, a folder for its files, `jobs`, the key, and the client's name.
 
         Raises:
-            HTTPException: 429 if the queue is full, 408 for a form that comes too slowly, 409 if a
-                request with the same key still arrives, 422 if the key belongs to another request.
+            HTTPException: 429 if the queue is full or the client has sent too many photos, 408 for
+                a form that comes too slowly, 409 if a request with the same key still arrives, 422
+                if the key belongs to another request.
         """
         if idempotency_key is None:
             job = await self._receive(request, accept, None)
@@ -447,15 +462,18 @@ class SceneHandlers:
         self, request: Request, accept: Callable[..., Job], key: RequestKey
     ) -> Job:
         """The job of a request with a key: that of an earlier one, or a new one."""
-        if key.idempotency_key in self.keys_in_progress:
+        # Two clients may choose the same key.
+        client = client_of(request.scope)
+        client_and_key = (client, key.idempotency_key)
+        if client_and_key in self.keys_in_progress:
             raise HTTPException(409, "a request with this Idempotency-Key still arrives")
-        former = self.jobs.with_key(key.idempotency_key)
+        former = self.jobs.with_key(key.idempotency_key, client)
         if former is None:
-            self.keys_in_progress.add(key.idempotency_key)
+            self.keys_in_progress.add(client_and_key)
             try:
                 return await self._receive(request, accept, key)
             finally:
-                self.keys_in_progress.discard(key.idempotency_key)
+                self.keys_in_progress.discard(client_and_key)
         if former.request_path != key.request_path:
             raise HTTPException(422, "Idempotency-Key: it belongs to another request")
         return former
@@ -464,8 +482,9 @@ class SceneHandlers:
         self, request: Request, accept: Callable[..., Job], key: RequestKey | None
     ) -> Job:
         """The new job of a form; see `_accept`."""
+        client = client_of(request.scope)
         # The place is reserved first, so that a refused photo is not even received.
-        with self.jobs.reserve_place() as upload_folder:
+        with self.rates.count_photo(client), self.jobs.reserve_place() as upload_folder:
             try:
                 # Two files, such as the photo and its depth map. Two text fields: the options, and
                 # the address to call at the end.
@@ -475,7 +494,9 @@ class SceneHandlers:
                 raise HTTPException(408, "the photo arrived too slowly") from None
             try:
                 async with self.decoding:
-                    return await run_in_threadpool(accept, form, upload_folder, self.jobs, key)
+                    return await run_in_threadpool(
+                        accept, form, upload_folder, self.jobs, key, client=client
+                    )
             finally:
                 await form.close()
 
@@ -490,9 +511,9 @@ class SceneHandlers:
         return state_with_files(job, self.jobs.place_of(job))
 
     async def list_scenes(
-        self, limit: PageSize = DEFAULT_PAGE_SIZE, after: PageMark = None
+        self, request: Request, limit: PageSize = DEFAULT_PAGE_SIZE, after: PageMark = None
     ) -> ScenePage:
-        """The states of all photos, the newest first, in pages."""
+        """The states of all photos of the client, the newest first, in pages."""
         # Somebody who may only look at a scene must know its id.
         if not self.takes_photos:
             raise HTTPException(401, "this page lists no scenes: it was opened without a token")
@@ -501,7 +522,7 @@ class SceneHandlers:
             created, _, id = after.partition("-")
             mark = (float(created), id)
         # One job more than asked for shows whether another page follows.
-        jobs = self.jobs.page(limit + 1, mark)
+        jobs = self.jobs.page(limit + 1, mark, client_of(request.scope))
         scenes = [self.state_of(job) for job in jobs[:limit]]
         next_mark = None
         if len(jobs) > limit:
@@ -598,6 +619,12 @@ class SceneHandlers:
         except InputError as error:
             raise HTTPException(503, str(error)) from error
         return Readiness()
+
+    async def check_owner(self, id: str, request: Request) -> None:
+        """HTTPException 404 if the scene with an id belongs to another client."""
+        job = self.jobs.by_id.get(id)
+        if job is not None and not may_use(client_of(request.scope), job.client):
+            raise HTTPException(404, "there is no such scene")
 
     def find_finished(self, id: str) -> Job:
         """The job with an id; HTTPException 404 if there is none, 409 if it has no scene yet."""

@@ -1,7 +1,7 @@
 """Callbacks: a client's server hears when its photo's scene is done or has failed.
 
-The messages are signed as Standard Webhooks says (https://www.standardwebhooks.com), with the token
-as the secret. They go only to hosts that whoever runs this server has named.
+The messages are signed as Standard Webhooks says (https://www.standardwebhooks.com), with the
+client's token as the secret. They go only to hosts that whoever runs this server has named.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import http.client
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
@@ -35,6 +35,7 @@ class Delivery(NamedTuple):
     """A message that is to be sent."""
 
     url: str
+    client: str  # who has sent the photo, and whose token signs the message
     due: float  # time.monotonic() of the next attempt
     attempt: int  # 0: the first one
 
@@ -42,16 +43,16 @@ class Delivery(NamedTuple):
 class CallbackSender:
     """Sends the states of ended jobs to the addresses that their clients have given."""
 
-    def __init__(self, hosts: Sequence[str], secret: str) -> None:
+    def __init__(self, hosts: Sequence[str], tokens: Mapping[str, str]) -> None:
         """Prepare to send; nothing is sent before `start`.
 
         Args:
             hosts: the only hosts that are called: "hooks.example.com" or "hooks.example.com:8443"
                 by https, "http://10.0.0.5:9000" without encryption. InputError for anything else.
-            secret: signs the messages.
+            tokens: sign the messages, by the names of the clients.
         """
         self._origins = frozenset(_allowed_origin(host) for host in hosts)
-        self._secret = secret.encode()
+        self._tokens = dict(tokens)
         self._deliveries: dict[str, Delivery] = {}  # by the id of a job
         self._changed = threading.Condition()  # also the lock of the two fields around it
         self._is_closed = False
@@ -91,9 +92,15 @@ class CallbackSender:
         for _ in range(SENDER_COUNT if self._origins else 0):
             threading.Thread(target=self._send_due, args=(describe, forget), daemon=True).start()
 
-    def schedule(self, id: str, url: str) -> None:
-        """Send the state of the job with an id to an address, as soon as a thread is free."""
-        self._put(id, Delivery(url, time.monotonic() + DELAYS_S[0], 0))
+    def schedule(self, id: str, url: str, client: str) -> None:
+        """Send the state of a client's job to an address, as soon as a thread is free.
+
+        Args:
+            id: of the job.
+            url: the address.
+            client: the name of the client.
+        """
+        self._put(id, Delivery(url, client, time.monotonic() + DELAYS_S[0], 0))
 
     def close(self) -> None:
         """Send nothing more."""
@@ -143,29 +150,32 @@ class CallbackSender:
         """
         if body is None:
             return
-        problem = self._send(id, delivery.url, body)
+        problem = self._send(id, delivery, body)
         next_attempt = delivery.attempt + 1
         if problem is not None and next_attempt < len(DELAYS_S):
             due = time.monotonic() + DELAYS_S[next_attempt]
-            self._put(id, Delivery(delivery.url, due, next_attempt))
+            self._put(id, delivery._replace(due=due, attempt=next_attempt))
             return
         if problem is not None:
             LOG.error(printable_line(f"error: callback about {id} given up: {problem}"))
         forget(id)
 
-    def _send(self, id: str, url: str, body: bytes) -> str | None:
+    def _send(self, id: str, delivery: Delivery, body: bytes) -> str | None:
         """Send a message once; returns None if it arrived, or why it did not.
 
         Only an answer of 2xx counts. A redirect is not followed, because it may lead to a host that
         nobody has allowed.
         """
-        parts = urlsplit(url)
+        token = self._tokens.get(delivery.client)
+        if token is None:
+            return f"there is no client {delivery.client} any more"
+        parts = urlsplit(delivery.url)
         secure = parts.scheme == "https"
         connection_type = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         connection = connection_type(str(parts.hostname), parts.port, timeout=TIMEOUT_S)
         target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         try:
-            connection.request("POST", target, body, self._headers(id, body))
+            connection.request("POST", target, body, _headers(id, body, token))
             status = connection.getresponse().status
         except (OSError, http.client.HTTPException) as error:
             return reason_in_a_line(error)
@@ -173,18 +183,19 @@ class CallbackSender:
             connection.close()
         return None if 200 <= status < 300 else f"the answer was {status}"
 
-    def _headers(self, id: str, body: bytes) -> dict[str, str]:
-        """The headers of a message, with its signature: HMAC-SHA256 of "ID.SECONDS.BODY"."""
-        seconds = str(int(time.time()))  # since 1970; receivers refuse old messages
-        signed = b".".join((id.encode(), seconds.encode(), body))
-        signature = base64.b64encode(hmac.digest(self._secret, signed, hashlib.sha256)).decode()
-        return {
-            "Content-Type": "application/json",
-            "User-Agent": "spackle",
-            "Webhook-Id": id,
-            "Webhook-Timestamp": seconds,
-            "Webhook-Signature": f"v1,{signature}",  # v1: the version of the way to sign
-        }
+
+def _headers(id: str, body: bytes, token: str) -> dict[str, str]:
+    """The headers of a message, with its signature: HMAC-SHA256 of "ID.SECONDS.BODY"."""
+    seconds = str(int(time.time()))  # since 1970; receivers refuse old messages
+    signed = b".".join((id.encode(), seconds.encode(), body))
+    signature = base64.b64encode(hmac.digest(token.encode(), signed, hashlib.sha256)).decode()
+    return {
+        "Content-Type": "application/json",
+        "User-Agent": "spackle",
+        "Webhook-Id": id,
+        "Webhook-Timestamp": seconds,
+        "Webhook-Signature": f"v1,{signature}",  # v1: the version of the way to sign
+    }
 
 
 def _origin(parts: SplitResult) -> tuple[str, str, int]:

@@ -22,6 +22,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from spackle.runtime.errors import printable_line
+from spackle.web.clients import CLIENT_KEY, OPERATOR, Client
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
 
 LOG = logging.getLogger("spackle.web")
@@ -70,10 +71,15 @@ class Access(NamedTuple):
     names: frozenset[str] = frozenset({"localhost"})  # accepted host names
     local: bool = True  # only this machine can connect
     public: PublicAddress = LOCAL_ONLY  # names and proxies outside of this machine
+    clients: tuple[Client, ...] = ()  # others with tokens of their own
 
     @staticmethod
     def for_listener(
-        host: str, address: str, token: str | None, public: PublicAddress = LOCAL_ONLY
+        host: str,
+        address: str,
+        token: str | None,
+        public: PublicAddress = LOCAL_ONLY,
+        clients: tuple[Client, ...] = (),
     ) -> Access:
         """The rules for a server that listens at `host`, whose numeric address is `address`.
 
@@ -81,12 +87,12 @@ class Access(NamedTuple):
         Names of `public` are accepted in any case.
         """
         if is_loopback(address):
-            return Access(token, public=public)
+            return Access(token, public=public, clients=clients)
         machine = socket.gethostname().lower()
         short_name = machine.partition(".")[0]
         # NAME.local is the name that machines of a home network use without a name server.
         names = frozenset({"localhost", machine, short_name, f"{short_name}.local", host.lower()})
-        return Access(token, names, local=False, public=public)
+        return Access(token, names, local=False, public=public, clients=clients)
 
     def authorize(self, scope: Scope, headers: Headers) -> Scope:
         """Check a request, and strip the token from its path.
@@ -97,6 +103,7 @@ class Access(NamedTuple):
 
         Returns:
             The request for the app, whose root path includes the token if the path began with it.
+            `clients.client_of` tells whose token it is.
 
         Raises:
             HTTPException: 403 for the name of another host or the page of another site, 401 without
@@ -116,13 +123,15 @@ class Access(NamedTuple):
         path = scope["path"]
         parts = path.removeprefix(root).split("/")
         first_part = parts[1] if path.count("/") > 1 else ""  # parts[0] is before the first slash
-        if self._is_token(first_part):
-            return {**scope, "root_path": f"{root}/{first_part}"}
+        client = self._holder_of(first_part)
+        if client is not None:
+            return {**scope, CLIENT_KEY: client, "root_path": f"{root}/{first_part}"}
 
         # Programs send the token as a header.
         bearer = headers.get("authorization", "").removeprefix("Bearer ")
-        if self._is_token(bearer):
-            return scope
+        client = self._holder_of(bearer)
+        if client is not None:
+            return {**scope, CLIENT_KEY: client}
 
         # The request has no valid token. A server that was started without one lets everybody read,
         # but nobody send photos. A server with a token only says whether it runs and is ready.
@@ -148,12 +157,22 @@ class Access(NamedTuple):
         except ValueError:  # no numeric address
             return name.rstrip(".") in self.names | self.public.names
 
-    def _is_token(self, word: str) -> bool:
-        """Whether a word is the token.
+    @property
+    def tokens(self) -> dict[str, str]:
+        """All tokens, by the name of the client; the server's own one is the operator's."""
+        tokens = {client.name: client.token for client in self.clients}
+        return tokens if self.token is None else {OPERATOR: self.token, **tokens}
+
+    def _holder_of(self, word: str) -> str | None:
+        """The name of the client whose token a word is, or None if it is no token.
 
         The comparison takes the same time for every word: it tells a stranger nothing.
         """
-        return self.token is not None and hmac.compare_digest(word.encode(), self.token.encode())
+        holder = None
+        for name, token in self.tokens.items():
+            if hmac.compare_digest(word.encode(), token.encode()):
+                holder = name
+        return holder
 
 
 def is_loopback(address: str) -> bool:
@@ -309,8 +328,8 @@ class Guard:
         return send_guarded
 
     def _log_request(self, scope: Scope, status: int) -> None:
-        """Log a request and the status of its answer; the token is replaced by "…"."""
+        """Log a request and the status of its answer; a token is replaced by "…"."""
         path = scope["path"]
-        if self.access is not None and self.access.token is not None:
-            path = path.replace(self.access.token, "…", 1)
+        for token in () if self.access is None else self.access.tokens.values():
+            path = path.replace(token, "…", 1)
         LOG.debug(printable_line(f"{scope['method']} {path} {status}"))

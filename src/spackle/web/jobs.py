@@ -23,6 +23,7 @@ from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import StageProgress
 from spackle.runtime.task_process import WORKER_DIED, TaskEvent, TaskFunction, TaskProcess
 from spackle.web.callbacks import CallbackSender
+from spackle.web.clients import OPERATOR, may_use
 
 LOG = logging.getLogger("spackle.web")
 RECORD_FILE = "job.json"  # stores the state of a job, in the folder of the job
@@ -109,6 +110,7 @@ class Job(SceneState):
     # Of an edit: the views to fill, or the view in which the mask was drawn, as JSON; the mask.
     cameras: list[dict[str, Any]] = []
     mask: str | None = None
+    client: str = OPERATOR  # the name of the client who has sent it
     callback_url: str | None = None  # is told the state at the end; None afterwards
     # What the client called its request, and where it sent it, so that it can repeat the request.
     idempotency_key: str | None = None
@@ -158,7 +160,7 @@ class Jobs:
         """
         self.folder = folder
         self.limits = keep
-        self.callbacks = CallbackSender((), "") if callbacks is None else callbacks
+        self.callbacks = CallbackSender((), {}) if callbacks is None else callbacks
         self._folder_lock = contextlib.ExitStack()
         self._folder_lock.enter_context(results_folder(folder, locked=True))
 
@@ -220,23 +222,25 @@ class Jobs:
         except ValueError:  # it has begun to run, or was deleted
             return None
 
-    def page(self, count: int, after: tuple[float, str] | None) -> list[Job]:
-        """Up to `count` jobs, the newest first.
+    def page(self, count: int, after: tuple[float, str] | None, client: str) -> list[Job]:
+        """Up to `count` jobs that a client may see, the newest first.
 
         Args:
             count: the number of jobs.
             after: time of creation and id of the last job of the page before; None: the first page.
+            client: the name of the client.
         """
-        jobs = sorted(self.by_id.values(), key=age_key, reverse=True)
+        visible_jobs = [job for job in list(self.by_id.values()) if may_use(client, job.client)]
+        jobs = sorted(visible_jobs, key=age_key, reverse=True)
         if after is not None:
             # Not the position of that job, which may be deleted by now.
             jobs = [job for job in jobs if age_key(job) < after]
         return jobs[:count]
 
-    def with_key(self, key: str) -> Job | None:
+    def with_key(self, key: str, client: str) -> Job | None:
         """The job of the request that a client has named by this key; None if there is none."""
         for job in list(self.by_id.values()):
-            if job.idempotency_key == key:
+            if job.idempotency_key == key and job.client == client:
                 return job
         return None
 
@@ -272,7 +276,7 @@ class Jobs:
         self.callbacks.start(state_of, self._forget_callback)
         for job in list(self.by_id.values()):
             if job.ended is not None and job.callback_url is not None:
-                self.callbacks.schedule(job.id, job.callback_url)
+                self.callbacks.schedule(job.id, job.callback_url, job.client)
 
     def _forget_callback(self, id: str) -> None:
         """Note that nobody is to be told the end of a job any more."""
@@ -346,6 +350,7 @@ class Jobs:
         edit: Edit | None = None,
         callback_url: str | None = None,
         key: RequestKey | None = None,
+        client: str = OPERATOR,
     ) -> Job:
         """Add a job for a photo or for an edit of a scene, and queue it; returns the job.
 
@@ -358,6 +363,7 @@ class Jobs:
             edit: what is to be done to the scene in the file `source`; None for a photo.
             callback_url: an address that `callbacks` accepts, which is told the end; or None.
             key: the name that the client has given to its request, if any.
+            client: the name of the client who has sent the photo.
         """
         id = folder.name.removeprefix(UPLOAD_PREFIX)
         job = Job(
@@ -367,6 +373,7 @@ class Jobs:
             depth=depth,
             options=options,
             callback_url=callback_url,
+            client=client,
             folder=folder,
         )
         if edit is not None:
@@ -551,7 +558,7 @@ class Jobs:
                         (job.folder / file).unlink(missing_ok=True)
             self.by_id[id] = ended_job
         if ended_job.callback_url is not None:
-            self.callbacks.schedule(id, ended_job.callback_url)
+            self.callbacks.schedule(id, ended_job.callback_url, ended_job.client)
         if error:
             LOG.error("error: %s", error)
 

@@ -30,6 +30,7 @@ from spackle.scene import Scene
 from spackle.views import PathOptions
 from spackle.web.app import create_app, make_server
 from spackle.web.callbacks import CallbackSender
+from spackle.web.clients import Client
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, RetentionLimits
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
@@ -51,6 +52,7 @@ class ServerAddress:
     port: int  # 0: any free port
     token: str | None  # the secret that a client must know; None: everybody on this machine may
     public: PublicAddress = LOCAL_ONLY  # names outside of this machine, and proxies
+    clients: tuple[Client, ...] = ()  # others with tokens and limits of their own
     callback_hosts: tuple[str, ...] = ()  # hosts that may be told that scenes are done
 
     def url_at(self, host: str, port: int) -> str:
@@ -263,7 +265,9 @@ def run_server(
         log_jobs_to(reporter),
     ):
         bound_host, port = listener.getsockname()[:2]
-        access = Access.for_listener(address.host, bound_host, address.token, address.public)
+        access = Access.for_listener(
+            address.host, bound_host, address.token, address.public, address.clients
+        )
         if not access.local and address.token is None:
             raise InputError(
                 f"`host` {address.host}: other machines can connect: leave `no_token` out"
@@ -281,7 +285,7 @@ def run_server(
             workers=workers,
             keep=limits,
             access=access,
-            callbacks=CallbackSender(address.callback_hosts, address.token or ""),
+            callbacks=CallbackSender(address.callback_hosts, access.tokens),
         )
         with contextlib.closing(app.state.jobs) as jobs:
             # The socket accepts connections already, so the caller may announce the page now.

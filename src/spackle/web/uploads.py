@@ -88,6 +88,7 @@ def accept_photo(
     jobs: Jobs,
     key: RequestKey | None,
     *,
+    client: str,
     bases: list[str],
 ) -> Job:
     """Store a form's photo, check that it can be decoded, and queue it; returns its job.
@@ -97,6 +98,7 @@ def accept_photo(
         upload_folder: an empty folder for the files, which `jobs` has reserved.
         jobs: receives the new job.
         key: the name that the client has given to its request, if any.
+        client: the name of the client.
         bases: the names of the bases, the networks for a photo's geometry, that may be chosen.
 
     Raises:
@@ -138,11 +140,18 @@ def accept_photo(
         options=given_options,
         callback_url=callback_url,
         key=key,
+        client=client,
     )
 
 
 def accept_fill(
-    form: FormData, upload_folder: Path, jobs: Jobs, key: RequestKey | None, *, parent: Job
+    form: FormData,
+    upload_folder: Path,
+    jobs: Jobs,
+    key: RequestKey | None,
+    *,
+    client: str,
+    parent: Job,
 ) -> Job:
     """Check a form that asks for a fill of a finished scene, and queue it; returns its job.
 
@@ -154,11 +163,17 @@ def accept_fill(
         _check_view(camera, f"cameras.{index}")
     edit = Edit("fill", parent.id, cameras)
     callback_url = jobs.callbacks.check(form.get("callback_url"))
-    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key)
+    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key, client)
 
 
 def accept_removal(
-    form: FormData, upload_folder: Path, jobs: Jobs, key: RequestKey | None, *, parent: Job
+    form: FormData,
+    upload_folder: Path,
+    jobs: Jobs,
+    key: RequestKey | None,
+    *,
+    client: str,
+    parent: Job,
 ) -> Job:
     """Check a form with the mask of a thing in a finished scene, and queue it; returns its job.
 
@@ -178,7 +193,7 @@ def accept_removal(
         raise HTTPException(415, str(error)) from error
     edit = Edit("remove", parent.id, [camera], MASK_FILE)
     callback_url = jobs.callbacks.check(form.get("callback_url"))
-    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key)
+    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key, client)
 
 
 def _edit_options(form: FormData, model: type[MODEL]) -> MODEL:
@@ -212,6 +227,7 @@ def _add_edit(
     parent: Job,
     callback_url: str | None,
     key: RequestKey | None,
+    client: str,
 ) -> Job:
     """Queue an edit of a scene, with files of its own; returns its job.
 
@@ -234,6 +250,7 @@ def _add_edit(
         edit=edit,
         callback_url=callback_url,
         key=key,
+        client=client,
     )
 
 
