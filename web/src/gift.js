@@ -3,7 +3,8 @@ import { tilt } from "./tilt.js";
 
 const TAP_MS = 300; // two taps within this time are a double tap
 const TAP_PIXELS = 12; // a finger that moves farther drags
-const SLIDERS = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M4 7h10M18 7h2M4 17h2M10 17h10"/><circle cx="16" cy="7" r="2.2"/><circle cx="8" cy="17" r="2.2"/></svg>';
+const ICONS = '<svg class="close" viewBox="0 0 24 24" aria-hidden="true"><path d="M6.5 6.5l11 11M17.5 6.5l-11 11"/></svg>'
+  + '<svg class="sliders" viewBox="0 0 24 24" aria-hidden="true"><path d="M4 7h10M18 7h2M4 17h2M10 17h10"/><circle cx="16" cy="7" r="2.2"/><circle cx="8" cy="17" r="2.2"/></svg>';
 
 /** Prepare the page of a file. Its scene is shown afterwards. */
 export function gift(viewer) {
@@ -37,7 +38,7 @@ function caption() {
 
 /** The button that shows the tools, and hides them again. */
 function corner() {
-  const button = Object.assign(document.createElement("button"), { type: "button", id: "corner", innerHTML: SLIDERS });
+  const button = Object.assign(document.createElement("button"), { type: "button", id: "corner", innerHTML: ICONS });
   const open = (on) => {
     document.body.classList.toggle("tools", on);
     button.setAttribute("aria-expanded", on);
