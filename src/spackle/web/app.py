@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import os
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, get_args
@@ -649,7 +650,13 @@ def path_of_file(job: Job, file: str) -> Path:
 
 def state_with_files(job: Job, place: int | None = None) -> SceneState:
     """The state of a job as clients see it, with its place and the files that exist now."""
-    files = [file for file in LISTED_FILES if path_of_file(job, file).is_file()]
+    # One look at the folder costs less than one at each file, and clients ask for states often.
+    existing: set[str] = set()
+    with contextlib.suppress(OSError):  # there are no results before the work begins
+        existing.update(os.listdir(job.results))
+    if path_of_file(job, PREVIEW).is_file():
+        existing.add(PREVIEW)
+    files = [file for file in LISTED_FILES if file in existing]
     return job.model_copy(update={"files": files, "place": place})
 
 
