@@ -328,7 +328,7 @@ class Scene:
 
     def show(self, height: int = 480) -> InlinePage:
         """A viewer with the scene, `height` pixels high, which a notebook displays in a cell."""
-        return InlinePage(single_html(self.page("scene")).decode(), height)
+        return InlinePage(self.page_file("scene").decode(), height)
 
     def save_video(
         self,
