@@ -9,12 +9,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, RootModel, StringConstraints, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.types import Scope
 
 from spackle.runtime.errors import InputError, reason_in_a_line
+from spackle.runtime.yaml_text import parse_yaml
 
 # The holder of the server's own token, who may see and do everything, without a limit.
 OPERATOR = ""
@@ -56,12 +56,12 @@ def read_clients(path: Path) -> tuple[Client, ...]:
     """
     advice = "give `NAME: {token: TEXT}` for each client, with tokens of 16 or more of A-Z a-z 0-9"
     try:
-        entries = ClientFile.model_validate(yaml.safe_load(path.read_text("utf-8"))).root
+        text = path.read_text("utf-8")
+        # The parser's own message would quote the file, and so perhaps a token.
+        content = parse_yaml(text, f"`clients` {path}", f"no YAML: {advice}")
+        entries = ClientFile.model_validate(content).root
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"`clients` {path}: {reason_in_a_line(error)}") from error
-    except yaml.YAMLError as error:
-        # The error's text quotes the file, and so perhaps a token.
-        raise InputError(f"`clients` {path}: no YAML: {advice}") from error
     except ValidationError as error:
         place = [str(part) for part in error.errors()[0]["loc"]]
         # What stands in the place of a name may be a token.

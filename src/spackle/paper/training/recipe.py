@@ -18,6 +18,7 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.suggestions import closest_name
 from spackle.runtime.validation import validated
+from spackle.runtime.yaml_text import parse_yaml
 from spackle.weights import installed_weights
 
 PACKAGED_RECIPES = Path(__file__).parent / "recipes"
@@ -292,18 +293,6 @@ def find_recipe(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
             "YAML file"
         )
     return path
-
-
-def parse_yaml(text: str, where: object) -> Any:
-    """The value that a YAML text holds; InputError, which names `where`, if it is no YAML."""
-    try:
-        import yaml
-    except ImportError as error:
-        raise InputError(
-            "recipes need a package for YAML: pip install 'spackle-nvs[train]'"
-        ) from error
-    with as_input_error(where, "not YAML: {reason}"):
-        return yaml.safe_load(text)
 
 
 def set_nested(content: Any, keys: Sequence[str], value: object) -> None:
