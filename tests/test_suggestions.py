@@ -95,7 +95,7 @@ def test_a_command_suggests(
     assert (done.code, message in done.err) == (2, True), done.err
 
 
-@pytest.mark.parametrize(("call", "message"), PYTHON, ids=lambda value: str(value)[:40])
+@pytest.mark.parametrize(("call", "message"), PYTHON, ids=[message[:40] for _, message in PYTHON])
 def test_python_suggests(call: Callable[[], object], message: str) -> None:
     with pytest.raises(spackle.InputError) as caught:
         call()
