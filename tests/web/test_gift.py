@@ -99,6 +99,7 @@ def test_it_plays_at_once_and_glides_from_the_photos_own_eye(browser: Any, file:
     context.close()
 
 
+@pytest.mark.slow
 def test_who_likes_no_motion_gets_a_still_picture(browser: Any, file: Path) -> None:
     page = opened(browser, file.as_uri(), reduced_motion="reduce").page
     settled(page, "spackle.ready")
@@ -108,6 +109,7 @@ def test_who_likes_no_motion_gets_a_still_picture(browser: Any, file: Path) -> N
     page.context.close()
 
 
+@pytest.mark.slow
 def test_the_eye_follows_a_turned_phone_within_the_filled_range(phone: Any) -> None:
     unit = phone.evaluate("spackle.description.orbit.unit")
     phone.evaluate("spackle.setView('swipe', 0, 0.5)")
@@ -130,6 +132,7 @@ def test_the_eye_follows_a_turned_phone_within_the_filled_range(phone: Any) -> N
     assert phone.evaluate(EYE) == far
 
 
+@pytest.mark.slow
 def test_a_browser_that_asks_for_permission_is_asked_in_a_tap(browser: Any, file: Path) -> None:
     context = browser.new_context(has_touch=True, viewport={"width": 390, "height": 844})
     page = context.new_page()
@@ -160,6 +163,7 @@ def test_a_tap_stops_the_motion_and_two_go_back_to_the_photo(phone: Any) -> None
     eventually(lambda: phone.evaluate(EYE) == [0, 0, 0])
 
 
+@pytest.mark.slow
 def test_firefox_opens_the_file_from_the_disk_and_moves_it(file: Path, tmp_path: Path) -> None:
     program = shutil.which("firefox-esr") or shutil.which("firefox")
     if program is None:

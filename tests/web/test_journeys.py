@@ -267,6 +267,7 @@ def test_what_is_no_photo_says_so(visit: Opened) -> None:
     assert states(page) == ["failed"] * len(refusals)
 
 
+@pytest.mark.slow
 def test_a_phones_photos_become_scenes(visit: Opened) -> None:
     page = visit.page
     pixels = picture() / 255.0
@@ -389,6 +390,7 @@ def test_a_photo_is_dropped_explored_saved_and_opened_from_the_disk(
     copy.page.context.close()
 
 
+@pytest.mark.slow
 def test_an_example_and_a_scene_are_explored(
     browser: Any, server: Served, visit: Opened, foreign: str
 ) -> None:
@@ -405,6 +407,7 @@ def test_an_example_and_a_scene_are_explored(
     look_around(page)
 
 
+@pytest.mark.slow
 @needs_posix_signals
 def test_the_page_of_a_command_is_explored(browser: Any, tmp_path: Path) -> None:
     write_photo(tmp_path / "holiday.png")

@@ -68,7 +68,7 @@ def saved(page: Any) -> tuple[str, bytes]:
     ("label", "shape", "size"),
     [
         pytest.param("Story", "story", (720, 1280), marks=pytest.mark.slow),
-        ("Square", "square", (720, 720)),
+        pytest.param("Square", "square", (720, 720), marks=pytest.mark.slow),
         pytest.param("Wide", "wide", (1280, 720), marks=pytest.mark.slow),
     ],
 )
