@@ -201,7 +201,9 @@ def test_the_page_shows_what_our_renderer_shows(page: Any) -> None:
     torch.testing.assert_close(divided[:, 64:], both[:, 64:], rtol=0, atol=1.5 / 255)
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize(
+    "degree", [pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow), 3]
+)
 def test_colours_change_with_the_view_as_our_renderer_changes_them(
     browser: Any, tmp_path: Path, degree: int
 ) -> None:
@@ -271,6 +273,7 @@ def test_the_whole_photo_and_every_control_has_room(page: Any, size: tuple[int, 
     page.set_viewport_size(before)
 
 
+@pytest.mark.slow
 def test_a_photo_is_sent_to_the_server_watched_and_dragged(browser: Any, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path / "first")
     nearest = metres().min()

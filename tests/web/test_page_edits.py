@@ -136,7 +136,13 @@ def paint(page: Any, radius: float) -> None:
     page.mouse.up()
 
 
-@pytest.mark.parametrize("screen", [WINDOW, PHONE], ids=["window", "phone"])
+@pytest.mark.parametrize(
+    "screen",
+    [
+        pytest.param(WINDOW, id="window"),
+        pytest.param(PHONE, id="phone", marks=pytest.mark.slow),
+    ],
+)
 def test_a_painted_thing_is_taken_out_and_put_back(
     browser: Any, server: Served, tmp_path: Path, screen: Any
 ) -> None:
