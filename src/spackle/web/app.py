@@ -57,7 +57,7 @@ from spackle.web.description import (
     resolve,
 )
 from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, STRANGER, Access, Guard
-from spackle.web.jobs import Job, Jobs, RequestKey, RetentionLimits, SceneState, age_key
+from spackle.web.jobs import Job, Jobs, RequestKey, RetentionLimits, SceneState, Submission, age_key
 from spackle.web.metrics import Metrics
 from spackle.web.public_address import LOCAL_ONLY
 from spackle.web.shared_videos import SharedVideo
@@ -441,12 +441,12 @@ class SceneHandlers:
             request: the request, with the form.
             response: gets the address of the job's state.
             idempotency_key: what the client calls its request, or None.
-            accept: takes the form, a folder for its files, `jobs`, the key, and the client's name.
+            accept: takes the form, a folder for its files, `jobs`, and a `Submission`.
 
         Raises:
             HTTPException: 429 if the queue is full or the client has sent too many photos, 408 for
                 a form that comes too slowly, 409 if a request with the same key still arrives, 422
-                if the key belongs to another request.
+                if the key belongs to another request, or for a `callback_url` that is none.
         """
         if idempotency_key is None:
             job = await self._receive(request, accept, None)
@@ -494,9 +494,12 @@ class SceneHandlers:
             except asyncio.TimeoutError:
                 raise HTTPException(408, "the photo arrived too slowly") from None
             try:
+                # Every form may have this field.
+                callback_url = self.jobs.callbacks.check(form.get("callback_url"))
+                submission = Submission(client, key, callback_url)
                 async with self.decoding:
                     return await run_in_threadpool(
-                        accept, form, upload_folder, self.jobs, key, client=client
+                        accept, form, upload_folder, self.jobs, submission
                     )
             finally:
                 await form.close()

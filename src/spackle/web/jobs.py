@@ -71,6 +71,17 @@ class RequestKey(NamedTuple):
     request_path: str
 
 
+class Submission(NamedTuple):
+    """Who has sent a photo or edit, and what else the client has said about its request."""
+
+    client: str = OPERATOR  # the client's name
+    key: RequestKey | None = None
+    callback_url: str | None = None  # an address that `callbacks` accepts, which is told the end
+
+
+OWN_SUBMISSION = Submission()  # of whoever runs the server
+
+
 class SceneState(BaseModel):
     """The state of a photo, as clients see it."""
 
@@ -348,9 +359,7 @@ class Jobs:
         depth: str | None,
         options: dict[str, Any],
         edit: Edit | None = None,
-        callback_url: str | None = None,
-        key: RequestKey | None = None,
-        client: str = OPERATOR,
+        submission: Submission = OWN_SUBMISSION,
     ) -> Job:
         """Add a job for a photo or for an edit of a scene, and queue it; returns the job.
 
@@ -361,9 +370,7 @@ class Jobs:
             depth: its depth map, in the same way; None if there is none.
             options: what the client has set.
             edit: what is to be done to the scene in the file `source`; None for a photo.
-            callback_url: an address that `callbacks` accepts, which is told the end; or None.
-            key: the name that the client has given to its request, if any.
-            client: the name of the client who has sent the photo.
+            submission: who has sent it.
         """
         id = folder.name.removeprefix(UPLOAD_PREFIX)
         job = Job(
@@ -372,8 +379,8 @@ class Jobs:
             source=source,
             depth=depth,
             options=options,
-            callback_url=callback_url,
-            client=client,
+            callback_url=submission.callback_url,
+            client=submission.client,
             folder=folder,
         )
         if edit is not None:
@@ -381,8 +388,8 @@ class Jobs:
             parts = edit._asdict()
             kind = parts.pop("kind")
             job = job.model_copy(update={"edit": kind, **parts})
-        if key is not None:
-            job = job.model_copy(update=key._asdict())
+        if submission.key is not None:
+            job = job.model_copy(update=submission.key._asdict())
         job.save()
         if self._is_warming_up:
             job = job.model_copy(update={"stage": WARM_UP})

@@ -26,7 +26,7 @@ from spackle.runtime.errors import InputError, printable_line, unknown_name
 from spackle.runtime.validation import validation_problem
 from spackle.web.description import BINARY_FILE, describe_form
 from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, sent_mask
-from spackle.web.jobs import Edit, Job, Jobs, RequestKey
+from spackle.web.jobs import Edit, Job, Jobs, Submission
 from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions, check_photo
 
 MAX_NAME_CHARACTERS = 80
@@ -86,9 +86,8 @@ def accept_photo(
     form: FormData,
     upload_folder: Path,
     jobs: Jobs,
-    key: RequestKey | None,
+    submission: Submission,
     *,
-    client: str,
     bases: list[str],
 ) -> Job:
     """Store a form's photo, check that it can be decoded, and queue it; returns its job.
@@ -97,13 +96,12 @@ def accept_photo(
         form: `photo` (a file), and perhaps `depth` (a file) and `options` (JSON).
         upload_folder: an empty folder for the files, which `jobs` has reserved.
         jobs: receives the new job.
-        key: the name that the client has given to its request, if any.
-        client: the name of the client.
+        submission: who has sent the form.
         bases: the names of the bases, the networks for a photo's geometry, that may be chosen.
 
     Raises:
-        HTTPException: 422 for a bad form, bad options or a bad `callback_url`, 400 for an empty
-            file, 415 for a file that is no photo of an accepted kind.
+        HTTPException: 422 for a bad form or bad options, 400 for an empty file, 415 for a file that
+            is no photo of an accepted kind.
     """
     # A form may hold anything: several photos, text in place of a file, a file in place of text.
     photo = form.get("photo")
@@ -114,7 +112,6 @@ def accept_photo(
             422, "send one photo as the file `photo`, and the options as the text `options`"
         )
     assert isinstance(photo, UploadFile)  # tells the type checker what is already known
-    callback_url = jobs.callbacks.check(form.get("callback_url"))
     photo_name = safe_display_name(photo.filename or "")
     options = read_options(options_text, bases)
 
@@ -138,9 +135,7 @@ def accept_photo(
         source=photo_file,
         depth=depth_file,
         options=given_options,
-        callback_url=callback_url,
-        key=key,
-        client=client,
+        submission=submission,
     )
 
 
@@ -148,9 +143,8 @@ def accept_fill(
     form: FormData,
     upload_folder: Path,
     jobs: Jobs,
-    key: RequestKey | None,
+    submission: Submission,
     *,
-    client: str,
     parent: Job,
 ) -> Job:
     """Check a form that asks for a fill of a finished scene, and queue it; returns its job.
@@ -162,17 +156,15 @@ def accept_fill(
     for index, camera in enumerate(cameras):
         _check_view(camera, f"cameras.{index}")
     edit = Edit("fill", parent.id, cameras)
-    callback_url = jobs.callbacks.check(form.get("callback_url"))
-    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key, client)
+    return _add_edit(edit, upload_folder, jobs, parent, submission)
 
 
 def accept_removal(
     form: FormData,
     upload_folder: Path,
     jobs: Jobs,
-    key: RequestKey | None,
+    submission: Submission,
     *,
-    client: str,
     parent: Job,
 ) -> Job:
     """Check a form with the mask of a thing in a finished scene, and queue it; returns its job.
@@ -192,8 +184,7 @@ def accept_removal(
     except InputError as error:
         raise HTTPException(415, str(error)) from error
     edit = Edit("remove", parent.id, [camera], MASK_FILE)
-    callback_url = jobs.callbacks.check(form.get("callback_url"))
-    return _add_edit(edit, upload_folder, jobs, parent, callback_url, key, client)
+    return _add_edit(edit, upload_folder, jobs, parent, submission)
 
 
 def _edit_options(form: FormData, model: type[MODEL]) -> MODEL:
@@ -221,13 +212,7 @@ def _check_view(camera: dict[str, Any], where: str) -> None:
 
 
 def _add_edit(
-    edit: Edit,
-    upload_folder: Path,
-    jobs: Jobs,
-    parent: Job,
-    callback_url: str | None,
-    key: RequestKey | None,
-    client: str,
+    edit: Edit, upload_folder: Path, jobs: Jobs, parent: Job, submission: Submission
 ) -> Job:
     """Queue an edit of a scene, with files of its own; returns its job.
 
@@ -248,9 +233,7 @@ def _add_edit(
         # are made when somebody asks for them.
         options={**parent.options, "files": []},
         edit=edit,
-        callback_url=callback_url,
-        key=key,
-        client=client,
+        submission=submission,
     )
 
 
