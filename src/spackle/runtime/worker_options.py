@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from spackle.runtime.device import thread_count
+from spackle.runtime.digests import config_differences
+from spackle.runtime.errors import InputError
 
 # A GPU keeps few threads busy, and a worker of a cluster should fit on any machine.
 THREADS_ON_RAY = 2
@@ -47,6 +52,21 @@ class WorkerOptions:
     def in_this_process(self) -> bool:
         """Whether the calling process does all jobs."""
         return self.ray is None and self.count == 1
+
+
+def check_like_command(expected: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """InputError if a worker's machine would give other results than that of the command.
+
+    Args:
+        expected: what determines the results, on the machine of the command.
+        own: the same on this machine.
+    """
+    changes = config_differences(expected, own)
+    if changes:
+        raise InputError(
+            f"{socket.gethostname()}: differs from the machine of the command "
+            f"({'; '.join(changes)}): all need the same packages, weights and kind of device"
+        )
 
 
 def gpu_worker_count(device: str) -> int:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
-import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -41,7 +40,7 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import remove_half_written, write_atomic
 from spackle.runtime.folders import make_folder, results_folder
 from spackle.runtime.progress import Progress, Reporter, catch_stop_signals, pluralized
-from spackle.runtime.worker_options import WorkerOptions
+from spackle.runtime.worker_options import WorkerOptions, check_like_command
 from spackle.runtime.workers import parallel_map
 
 PARTS_FOLDER = "parts"  # folder in the output for samples that are not in a shard yet
@@ -115,15 +114,13 @@ class SampleMaker:
         has this `config`.
         """
         maker = SampleMaker(options, parts)
+        # On the machine of the command there is nothing to compare.
+        if options.ray is None:
+            return maker
         own_config = dataset_configuration(options, (), maker.inpainter)
         # Workers get one photo at a time, so they do not know them all.
         own_config["photos"] = config["photos"]
-        changes = config_differences(config, own_config)
-        if changes:
-            raise InputError(
-                f"{socket.gethostname()}: differs from the machine of the command "
-                f"({'; '.join(changes)}): all need the same weights"
-            )
+        check_like_command(config, own_config)
         return maker
 
     def make(self, photo: PhotoFile) -> PhotoResult:

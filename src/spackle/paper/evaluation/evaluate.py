@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import socket
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -56,13 +55,12 @@ from spackle.paper.evaluation.table import NOT_RUN, to_plain_lines
 from spackle.paper.evaluation.tables import LATEX_FILE, MARKDOWN_FILE, make_tables, write_tables
 from spackle.residual import hole_mask
 from spackle.runtime.device import hardware_facts, package_versions
-from spackle.runtime.digests import config_differences
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import results_folder
 from spackle.runtime.plugins import is_plugin, load_function
 from spackle.runtime.progress import Reporter, pluralized
-from spackle.runtime.worker_options import WorkerOptions
+from spackle.runtime.worker_options import WorkerOptions, check_like_command
 from spackle.scene_fill import FillContext
 
 
@@ -193,15 +191,10 @@ def _open_worker(
         InputError: this machine would give other results than that of the command.
     """
     evaluation = open_evaluation(options, earlier_metrics)
-    changes = config_differences(
+    check_like_command(
         {**plan.config, "metrics": plan.about["metrics"]},
         {**evaluation.config, "metrics": evaluation.metric_states},
     )
-    if changes:
-        raise InputError(
-            f"{socket.gethostname()}: differs from the machine of the command "
-            f"({'; '.join(changes)}): all need the same packages, weights and kind of device"
-        )
     return _worker_of(evaluation, plan, verbose)
 
 
