@@ -16,11 +16,6 @@ export function gift(viewer) {
   tilt(viewer);
 }
 
-/** What the page is called: the scene's name, without the end of a file's. */
-export function title({ name }) {
-  return name.replace(/(?<=.)\.[^.\s]{1,5}$/, "");
-}
-
 /** The photo, blurred, fills what the picture leaves of the window. */
 function backdrop() {
   const photo = document.getElementById("photo");

@@ -2,7 +2,7 @@
 import { offerBetter } from "./better.js";
 import { control } from "./controls.js";
 import { cameraAt, Edits } from "./edits.js";
-import { gift, title } from "./gift.js";
+import { gift } from "./gift.js";
 import { divider, fit, name, panel, roomy, unfold } from "./panel.js";
 import { Queue } from "./queue.js";
 import { sharing } from "./share.js";
@@ -57,7 +57,8 @@ async function first() {
   const own = await source.embedded();
   if (own) {
     gift(viewer);
-    return show(own).then(() => (document.title = title(own.description)));
+    const { title } = document; // the file's own, which stays
+    return show(own).then(() => (document.title = title));
   }
   ({ upload } = await source.current());
   element("open").hidden = !upload;
