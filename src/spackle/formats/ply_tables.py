@@ -86,9 +86,8 @@ def ply_header(
         # repr() writes as many digits as the exact number needs.
         lines.append("comment spackle_camera " + " ".join(repr(number) for number in numbers))
         if not is_at_origin(camera):
-            rows = (
-                camera.world_to_camera.double()[:3].flatten().tolist()
-            )  # the last row is always 0 0 0 1
+            # The last row is always 0 0 0 1.
+            rows = camera.world_to_camera.double()[:3].flatten().tolist()
             lines.append("comment spackle_pose " + " ".join(repr(number) for number in rows))
     if base_count is not None:
         lines.append(f"comment spackle_base {base_count!r}")

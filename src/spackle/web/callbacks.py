@@ -20,6 +20,7 @@ from urllib.parse import SplitResult, urlsplit
 from starlette.exceptions import HTTPException
 
 from spackle.runtime.errors import InputError, printable_line, reason_in_a_line
+from spackle.web.public_address import USUAL_PORTS
 
 LOG = logging.getLogger("spackle.web")
 # Seconds before each attempt. A host that restarts is back within the first ones, a host that has
@@ -28,7 +29,6 @@ DELAYS_S = (0.0, 5.0, 30.0, 300.0, 1800.0)
 TIMEOUT_S = 10.0  # for the connection, and for each part of an answer
 SENDER_COUNT = 4  # messages at a time, so that one slow host does not hold up all others
 MAX_URL_CHARACTERS = 2000
-USUAL_PORTS = {"http": 80, "https": 443}
 
 
 class Delivery(NamedTuple):

@@ -329,6 +329,8 @@ class Guard:
 
     def _log_request(self, scope: Scope, status: int) -> None:
         """Log a request and the status of its answer; a token is replaced by "…"."""
+        if not LOG.isEnabledFor(logging.DEBUG):  # clients ask for states many times a second
+            return
         path = scope["path"]
         for token in () if self.access is None else self.access.tokens.values():
             path = path.replace(token, "…", 1)

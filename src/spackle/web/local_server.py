@@ -128,12 +128,12 @@ def show_page(
             reporter=reporter,
         ) as (jobs, urls),
     ):
-        # The page shows the scene whose id follows the # in its address.
         # A scene is shown at once; all else needs what the warm-up prepares.
         is_scene = target is not None and scene_suffix(target) is not None
         if not is_scene:
             jobs.warm_up()
         if target is not None:
+            # The page shows the scene whose id follows the # in its address.
             job_id = _add_target(jobs, target, title, options)
             urls = [f"{url}#{job_id}" for url in urls]
         if is_scene:
