@@ -2,7 +2,7 @@
 FROM python:3.12-slim-bookworm
 
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
-# Kernels for every processor of the image's kind; x86-64-v3 (with AVX2, since 2013) draws faster.
+# Kernels for every processor of the image's kind; x86-64-v3 needs AVX2 (since 2013).
 ARG CPU=generic
 ENV PIP_NO_CACHE_DIR=1 \
     PIP_DISABLE_PIP_VERSION_CHECK=1 \
