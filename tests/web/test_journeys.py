@@ -220,6 +220,30 @@ def test_keys_and_words_suit_the_scene(browser: Any, server: Served, foreign: st
     page.context.close()
 
 
+# The visible controls that leave the window, or whose text leaves them.
+CONTROLS = "header button, #bar button, #bar select, #bar summary"
+TOO_LARGE = """(controls) => [...document.querySelectorAll(controls)]
+  .filter((control) => control.checkVisibility())
+  .filter((control) => {
+    const { left, right, top, bottom } = control.getBoundingClientRect();
+    const leaves = left < 0 || top < 0 || right > innerWidth || bottom > innerHeight;
+    return leaves || control.scrollWidth > control.clientWidth + 1;
+  })
+  .map((control) => control.textContent.trim() || control.id)"""
+
+
+def test_every_control_of_a_served_page_has_room(browser: Any, server: Served) -> None:
+    scene = server.send(photo("box.png")["buffer"], "box.png").json["id"]
+    server.events(scene)
+    page = opened(browser, address(server, scene)).page
+    settled(page, "spackle.ready")
+    for size in ((1440, 900), (1380, 800), (1024, 768), (320, 640), (844, 390)):
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        unfold(page)
+        assert page.evaluate(TOO_LARGE, CONTROLS) == [], size
+    page.context.close()
+
+
 def test_where_there_are_metres_move_says_centimetres(visit: Opened) -> None:
     page = visit.page
     page.locator("summary").click()
