@@ -46,25 +46,20 @@ function corner() {
   document.body.append(button);
 }
 
-/** A tap lets the picture move or stand, and two show the photo's own view. */
+/** A tap lets the picture move or stand, and a second one soon after it shows the photo's own view. */
 function taps(viewer) {
   const { canvas } = viewer;
   let down = null;
-  let timer = null;
+  let lastTap = -Infinity; // when the finger touched, by the clock of the events, which a slow page does not delay
   canvas.addEventListener("pointerdown", (event) => (down = event.isPrimary ? event : null));
   canvas.addEventListener("pointerup", (event) => {
     const isTap = down && Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) < TAP_PIXELS;
+    const isSecond = isTap && down.timeStamp - lastTap < TAP_MS;
+    if (isTap) lastTap = isSecond ? -Infinity : down.timeStamp;
     down = null;
     if (!isTap || !viewer.description || event.button) return;
-    if (timer) {
-      clearTimeout(timer);
-      timer = null;
-      return viewer.home();
-    }
-    timer = setTimeout(() => {
-      timer = null;
-      if (viewer.playing) viewer.pause();
-      else viewer.play();
-    }, TAP_MS);
+    if (isSecond) viewer.home();
+    else if (viewer.playing) viewer.pause();
+    else viewer.play();
   });
 }
