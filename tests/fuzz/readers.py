@@ -24,6 +24,7 @@ from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.core.image_files import upright_size
 from spackle.core.keyframes import PathError
 from spackle.core.photo import load_photo, resize_photo
+from spackle.core.photo_lists import photos_of
 from spackle.depth.in_photo.layouts import load_photo_depth
 from spackle.depth.readers import DepthValue, load_depth
 from spackle.depth.units import parse_depth_unit
@@ -32,7 +33,6 @@ from spackle.formats.camera_readers import camera_source_files, is_path_file, re
 from spackle.formats.scene_files import load_scene
 from spackle.paper.dataset import DatasetFiles
 from spackle.paper.dataset.inspect import find_problems
-from spackle.paper.dataset.photos import find_photos
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.evaluation.case import load_case
 from spackle.paper.evaluation.datasets import find_dataset, find_scenes, read_cases
@@ -219,7 +219,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "keyframes": lambda folder: load_path(_only(folder)),
     "calibrations": lambda folder: load_depth(next(folder.glob("disp*"))),
     "recipes": lambda folder: load_recipe(Recipe, _only(folder)),
-    "coco": lambda folder: find_photos(folder / "a.json", folder / "images", _say),
+    "coco": lambda folder: list(photos_of(folder / "a.json", folder=folder / "images", log=_say)),
     "datasets": _read_dataset,
     "weights": _read_weights,
     "clips": _read_clip,

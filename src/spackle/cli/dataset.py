@@ -37,7 +37,9 @@ def dataset_build(
     photos: Annotated[
         Path,
         typer.Argument(
-            metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations."
+            metavar="FOLDER|LIST",
+            help="Photos, with subfolders; or a list: COCO annotations (.json), one path a line "
+            "(.txt), or a manifest (.jsonl); see docs/dataset.md.",
         ),
     ],
     output: Annotated[
@@ -52,7 +54,7 @@ def dataset_build(
     images: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's folder."
+            metavar="FOLDER", help="Folder where a list's paths begin; default: the list's own."
         ),
     ] = None,
     sample: Annotated[

@@ -22,9 +22,10 @@ from helpers.photos import picture
 from helpers.systems import needs_posix_signals
 from PIL import Image
 
+from spackle.core.photo_lists import photos_of
 from spackle.paper.dataset import DatasetFiles
 from spackle.paper.dataset.build import PhotoResult, SampleMaker
-from spackle.paper.dataset.photos import PhotoFile, choose_photos, find_photos
+from spackle.paper.dataset.photos import PhotoFile, choose_photos
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.sample_factory import Source, digest_of_samples
@@ -177,13 +178,39 @@ def test_coco_annotations_name_the_photos(place: Path, tmp_path: Path) -> None:
         refuses(run("dataset", "build", moved, *options), "coco.json")
 
 
+def test_a_manifest_names_photos_depth_maps_and_focal_lengths(place: Path, tmp_path: Path) -> None:
+    manifest = tmp_path / "photos.jsonl"
+    lines = [
+        {"file_name": "photos/0.png", "depth_file_name": str(place / "depth" / "0.npy")},
+        {"file_name": "photos/deep/1.png", "depth_file_name": "depth/deep/1.npy", "fov": 100},
+        {"file_name": "photos/4.png"},
+        {"file_name": "photos/3.png", "depth_file_name": "depth/gone.npy"},
+    ]
+    manifest.write_text("\n".join(map(json.dumps, lines)))
+    options = ["--images", place, *SHORT, "--views", 2, "-o", tmp_path / "out"]
+    done = run("dataset", "build", manifest, *options)
+    assert done.code == 0, done.err
+    photos = DatasetFiles(tmp_path / "out")
+    assert [sample.photo for _, sample in photos.samples] == ["photos/0.png", "photos/deep/1.png"]
+    assert photos[1].facts["photo"]["focal_source"] == "fov"
+    # Photos without a usable depth map are named; the manifest has no path of this machine.
+    first, second = [line for shard in photos.manifest.shards for line in shard.passed_over]
+    assert first.startswith("photos/3.png: gone.npy: no such")
+    assert second.startswith("photos/4.png: `base` rgbd needs depth")
+
+    # Another focal length is another dataset.
+    lines[1]["fov"] = 90
+    manifest.write_text("\n".join(map(json.dumps, lines)))
+    refuses(run("dataset", "build", manifest, *options), "holds a dataset with other options")
+
+
 def test_a_subset_depends_on_the_seed_alone(place: Path) -> None:
     def subset(count: int, seed: int, order: int = 1) -> list[str]:
-        root, names = find_photos(place / "photos", None, print)
+        photos = list(photos_of(place / "photos", recursive=True))
         return [
             photo.name
             for photo in choose_photos(
-                root, names[::order], count, seed, print, lambda done, total: None
+                place, photos[::order], count, seed, print, lambda done, total: None
             )
         ]
 

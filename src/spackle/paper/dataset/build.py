@@ -22,9 +22,10 @@ from rich.filesize import decimal
 
 from spackle.bases.open import BaseError, open_base
 from spackle.core.photo import load_photo, resize_photo
+from spackle.core.photo_lists import photos_of
 from spackle.paper.dataset.encoding import decode_gaussians, encode_gaussians
 from spackle.paper.dataset.options import DatasetOptions, completion_facts, dataset_configuration
-from spackle.paper.dataset.photos import PhotoFile, choose_photos, find_photos
+from spackle.paper.dataset.photos import PhotoFile, choose_photos
 from spackle.paper.dataset.sample import pack_sample
 from spackle.paper.dataset.shards import MANIFEST_NAME, Manifest, load_manifest, write_shard
 from spackle.paper.dataset.views import (
@@ -47,10 +48,10 @@ PARTS_FOLDER = "parts"  # folder in the output for samples that are not in a sha
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
-    """Build a dataset from a folder of photos or from COCO annotations, or resume an earlier build.
+    """Build a dataset from a folder or a list of photos, or resume an earlier build.
 
     Args:
-        source: the folder, or the COCO file, which names photos.
+        source: the folder, or a file that lists photos; see `photos_of`.
         output: the folder of the dataset.
         options: what to build.
         reporter: shows progress.
@@ -62,15 +63,15 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
         InputError: options, photos or folders cannot be used, or `output` holds another dataset.
     """
     # Errors in options and weights come now, before any long work.
-    options.check()
+    options.check(source)
     maker = SampleMaker(options, output / PARTS_FOLDER)
     # Some inpainters have a licence that the user should know of.
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
 
-    root, names = find_photos(source, options.images, reporter.log)
+    listed = list(photos_of(source, folder=options.images, recursive=True, log=reporter.log))
     with reporter.stage("photos") as progress:
-        photos = choose_photos(root, names, options.sample, options.seed, reporter.log, progress)
+        photos = choose_photos(source, listed, options.sample, options.seed, reporter.log, progress)
     # The record by which a later run of the same command knows that it is the same build.
     config = dataset_configuration(options, photos, maker.inpainter)
     with results_folder(output, (MANIFEST_NAME,), locked=True):
@@ -148,7 +149,12 @@ class SampleMaker:
         InputError if the photo or its depth cannot be used.
         """
         options = self.options
-        photo = load_photo(file.path)
+        photo = load_photo(
+            file.path,
+            focal_px=file.lens.focal_px,
+            focal_mm=file.lens.focal_mm,
+            fov=file.lens.fov,
+        )
         # The second result says which base it was; here it is always the same.
         prediction, _ = self.base.predict(photo, options.find_depth(file))
         # The dataset holds rounded Gaussians, so its views show these: whoever renders them again
@@ -408,6 +414,8 @@ class DatasetBuild:
         not.
         """
         problem = problem.replace(str(photo.path), photo.name)
+        if photo.depth is not None:
+            problem = problem.replace(str(photo.depth), photo.depth.name)
         depth_folder = self.options.base.depth
         # A folder without a name, "." or "/", would be found anywhere in the message.
         if isinstance(depth_folder, Path) and depth_folder.name:

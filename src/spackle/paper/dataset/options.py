@@ -10,6 +10,7 @@ from typing import Any
 
 import spackle
 from spackle.bases.settings import NETWORK_BASES, BaseSettings
+from spackle.core.photo_lists import MANIFEST_SUFFIX
 from spackle.core.trajectories import MAX_DISPARITY, SharpTrajectory
 from spackle.depth.readers import find_depth_file
 from spackle.inpaint import (
@@ -33,7 +34,7 @@ class DatasetOptions:
     """The options of `spackle dataset build`; the command line checks the bounds of its numbers."""
 
     base: BaseSettings  # turns a photo into Gaussians: a network, or depth maps
-    images: Path | None = None  # folder of a COCO JSON's photos
+    images: Path | None = None  # folder of a list's photos; None: the list's own
     sample: int | None = None  # number of photos; None: all
     seed: int = 0  # for the choice of photos and paths
     views: int = 20  # per photo, including the photo's camera, as in the paper
@@ -63,14 +64,14 @@ class DatasetOptions:
         )
         return get_inpainter(self.inpainter, options)
 
-    def check(self) -> None:
-        """InputError if options contradict each other.
+    def check(self, source: Path) -> None:
+        """InputError if options contradict each other, or `source`, the folder or list of photos.
 
         Inpainters check their own options when they are opened.
         """
         # "auto" may take another network on another machine, so a dataset names its base.
         self.base.check(allow_auto=False)
-        self._check_depth()
+        self._check_depth(source)
         self._check_completion()
         low, high = self.disparity
         if not 0 < low <= high <= MAX_DISPARITY:
@@ -79,12 +80,15 @@ class DatasetOptions:
                 f"{MAX_DISPARITY:g}, the smaller first"
             )
 
-    def _check_depth(self) -> None:
+    def _check_depth(self, source: Path) -> None:
         """InputError if the base needs depth and gets none, or depth is not a folder."""
         depth = self.base.depth
-        if depth is None and not self.base.uses_network:
+        # A manifest may name a depth map for each photo; a photo without one is passed over.
+        has_manifest = source.suffix.lower() == MANIFEST_SUFFIX
+        if depth is None and not self.base.uses_network and not has_manifest:
             raise InputError(
-                f"`base` {self.base.name} needs depth: give `depth` FOLDER; "
+                f"`base` {self.base.name} needs depth: give `depth` FOLDER, or a manifest of the "
+                f"photos ({MANIFEST_SUFFIX}) that names their depth maps; "
                 f"{', '.join(NETWORK_BASES)} need no depth"
             )
         # A file would be the depth of a single photo.
@@ -111,10 +115,13 @@ class DatasetOptions:
             )
 
     def find_depth(self, photo: PhotoFile) -> Path | None:
-        """A photo's depth map: in the photo's subfolder of `base.depth`, or else in that folder.
+        """A photo's depth map: the manifest's, or that in the photo's subfolder of `base.depth`, or
+        else that in `base.depth` itself.
 
         None if the base takes no depth. InputError if there is no map for the photo.
         """
+        if photo.depth is not None and not self.base.uses_network:
+            return photo.depth
         folder = self.base.depth
         if not isinstance(folder, Path):
             return None
@@ -123,8 +130,10 @@ class DatasetOptions:
         return find_depth_file(subfolder if subfolder.is_dir() else folder, photo.path)
 
     def input_digests(self, photo: PhotoFile) -> list[str]:
-        """Name and digest of a photo, and the digest of its depth map, if it has one."""
+        """Name and digest of a photo, the focal length that its manifest states, and the digest of
+        its depth map; without what it does not have."""
         digests = [photo.name, photo.sha256]
+        digests += [f"{option} {value}" for option, value in photo.lens.stated.items()]
         # A missing depth map is no error yet: the build reports it, and goes on.
         with contextlib.suppress(InputError):
             depth_file = self.find_depth(photo)
