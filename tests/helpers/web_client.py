@@ -167,6 +167,9 @@ def post(length: int, *headers: str, method: str = "POST") -> bytes:
 def eventually(condition: Callable[[], object]) -> None:
     """Wait until the condition holds; a busy machine may take minutes."""
     end = time.monotonic() + PATIENCE_S
+    pause = 0.01  # seconds
     while not condition():
         assert time.monotonic() < end, "the condition stayed false"
-        time.sleep(0.01)
+        time.sleep(pause)
+        # Longer and longer, because who asks a browser takes time from what it waits for.
+        pause = min(1.5 * pause, 0.25)

@@ -1,6 +1,6 @@
 // One dialog for everything that can be sent: a video in the shape of where it goes, a page, a link.
 import { download, fileName } from "./save.js";
-import { fetched } from "./source.js";
+import { fetched, link } from "./source.js";
 
 const FORM = `<form method="dialog">
   <h2>Share</h2>
@@ -29,7 +29,6 @@ const LINES = {
   page: "One file that shows the picture and its motion; it opens in every browser.",
 };
 const TYPES = { ".mp4": "video/mp4", ".gif": "image/gif", ".html": "text/html" };
-const NO_CAPTION = '<meta property="og:description" content="">';
 
 export function sharing(viewer, say) {
   const button = document.getElementById("share");
@@ -57,8 +56,9 @@ export function sharing(viewer, say) {
   });
   does("send").onclick = () => work(async () => send(await made()));
   does("link").onclick = () => work(async () => {
-    await copied(location.href);
-    line.textContent = "The link is copied. Who has it can see this scene while Spackle runs, and send photos.";
+    const address = await link(viewer.id, what.value === "scene" ? caption.value.trim() : "");
+    await copied(address ?? location.href);
+    line.textContent = "The link is copied. Who has it sees this scene, and nothing else, while Spackle runs.";
   });
 
   function update() {
@@ -79,8 +79,7 @@ export function sharing(viewer, say) {
   async function made() {
     const key = [viewer.id, what.value, suffix(), caption.value].join("\n");
     if (last.key === key) return last.file;
-    let blob = await fetched(viewer.id, `${what.value}${suffix()}`);
-    if (suffix() === ".html") blob = withCaption(await blob.text(), caption.value.trim());
+    const blob = await fetched(viewer.id, `${what.value}${suffix()}`, suffix() === ".html" ? caption.value.trim() : "");
     const shape = what.value === "scene" ? "" : `-${what.value}`;
     last = { key, file: new File([blob], `${fileName(viewer)}${shape}${suffix()}`, { type: TYPES[suffix()] }) };
     return last.file;
@@ -128,10 +127,4 @@ async function copied(text) {
   const done = document.execCommand("copy");
   field.remove();
   if (!done) throw new Error(`copy it from the address bar: ${text}`);
-}
-
-/** A page with a caption where it had none. */
-function withCaption(page, caption) {
-  const escaped = caption.replace(/[&<>"]/g, (letter) => `&#${letter.charCodeAt(0)};`);
-  return page.replace(NO_CAPTION, () => NO_CAPTION.replace('""', () => `"${escaped}"`));
 }

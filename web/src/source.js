@@ -62,9 +62,17 @@ export async function load(id, onProgress = () => {}) {
   });
 }
 
-/** A file that the server makes of a scene; it may take a while. */
-export async function fetched(id, name) {
-  return (await answer(await fetch(file(id, name)))).blob();
+/** A file that the server makes of a scene; it may take a while. A page may have a caption. */
+export async function fetched(id, name, caption = "") {
+  const query = caption && `?caption=${encodeURIComponent(caption)}`;
+  return (await answer(await fetch(file(id, name) + query))).blob();
+}
+
+/** The address of a page that shows one scene, or null where everybody can see the server's own. */
+export async function link(id, caption) {
+  const asked = here(`${SCENES}/${id}/link?caption=${encodeURIComponent(caption)}`);
+  const { path } = await (await answer(await fetch(asked))).json();
+  return path && new URL(path, location.href).href;
 }
 
 /** Give the server a photo; the id of its scene. */

@@ -76,6 +76,7 @@ VIEWING_ITEMS = ("camera", "focus", "zNear", "orbit", "paths", "isMetric", "isPh
 
 # The places in the page where the title, the icon, the photo, the style and the script are put.
 TITLE_TAG = "<title>Spackle</title>"
+META_TAG = '<meta property="{name}" content="{value}">'
 ICON_TAG = '<link rel="icon" href="data:,">'
 PHOTO_TAG = '<img id="photo"'
 STYLE_TAG = '<link rel="stylesheet" href="viewer.css">'
@@ -467,6 +468,26 @@ def _files_to_send(scene: PageScene) -> tuple[dict[str, bytes], list[str]]:
     return files, compact_names
 
 
+def with_tags(page: bytes, caption: str, image_address: str | None = None) -> bytes:
+    """Return a page of `single_html` with another caption.
+
+    Args:
+        page: the page.
+        caption: the text below the picture; empty for none.
+        image_address: where programs that show previews of links find the picture, on the web;
+            None leaves it within the page.
+    """
+    tags = {"og:description": caption}
+    if image_address is not None:
+        tags["og:image"] = image_address
+    for name, value in tags.items():
+        pattern = re.escape(META_TAG.format(name=name, value="VALUE")).replace("VALUE", '[^"]*')
+        tag = META_TAG.format(name=name, value=html.escape(value)).encode()
+        # The tags stand before everything that was embedded.
+        page = re.sub(pattern.encode(), lambda _, tag=tag: tag, page, count=1)  # type: ignore[misc]
+    return page
+
+
 def _title_tags(name: str, caption: str, preview: Tensor | None) -> str:
     """Return the tags of a page's head that say what it is: to browsers, and to link previews.
 
@@ -477,14 +498,14 @@ def _title_tags(name: str, caption: str, preview: Tensor | None) -> str:
     title = html.escape(re.sub(FILE_SUFFIX, "", printable_name))
     tags = [
         f"<title>{title}</title>",
-        f'<meta property="og:title" content="{title}">',
-        f'<meta property="og:description" content="{html.escape(caption)}">',
+        META_TAG.format(name="og:title", value=title),
+        META_TAG.format(name="og:description", value=html.escape(caption)),
     ]
     if preview is not None:
         # Programs that show previews of links want an address on the web here, which only who
         # publishes the page can know; some take the picture itself.
         image = _jpeg_address(preview, OPEN_GRAPH_SIDE_PX)
-        tags.append(f'<meta property="og:image" content="{image}">')
+        tags.append(META_TAG.format(name="og:image", value=image))
     return "\n".join(tags)
 
 

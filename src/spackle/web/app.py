@@ -34,7 +34,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 import spackle
 from spackle.bases.settings import AUTO
 from spackle.core.image_formats import PHOTO_SUFFIXES
-from spackle.formats.html import read_page_file
+from spackle.formats.html import read_page_file, with_tags
 from spackle.runtime.errors import InputError, printable_line
 from spackle.runtime.task_process import TaskFunction
 from spackle.web.better_depth import BetterDepth, FetchState
@@ -46,6 +46,7 @@ from spackle.web.description import (
     DELETED,
     FILE,
     HEALTH,
+    LINK,
     MEDIA_TYPES,
     OCTETS,
     PAGE_OF_STATES,
@@ -56,10 +57,19 @@ from spackle.web.description import (
     refusals,
     resolve,
 )
-from spackle.web.guard import MAX_UPLOAD_BYTES, SECURITY_HEADERS, STRANGER, Access, Guard
+from spackle.web.guard import (
+    MAX_UPLOAD_BYTES,
+    POLICY_HEADER,
+    SECURITY_HEADERS,
+    STRANGER,
+    Access,
+    Guard,
+    outer_root,
+)
 from spackle.web.jobs import Job, Jobs, RequestKey, RetentionLimits, SceneState, Submission, age_key
 from spackle.web.metrics import Metrics
 from spackle.web.public_address import LOCAL_ONLY
+from spackle.web.scene_links import MAX_CAPTION_LENGTH, SHARED_PATH, SceneLink, SceneLinks
 from spackle.web.shared_videos import SharedVideo
 from spackle.web.uploads import (
     FILL_FORM,
@@ -91,6 +101,9 @@ MAX_CONNECTIONS = 512  # open at a time; further ones are refused
 MAX_HEAD_S = 10.0  # seconds that a client may take to send the head of a request
 DEFAULT_PAGE_SIZE = 20  # states
 MAX_PAGE_SIZE = 100
+PAGE_FILE = "scene.html"
+# Of a scene's page, whose own policy names its script and style and forbids everything else.
+SHARED_HEADERS = {POLICY_HEADER: "frame-ancestors 'none'", "X-Robots-Tag": "noindex"}
 BUSY = object()  # marks a connection that is not idle
 DEFAULT_WORK = SceneWork()
 DEFAULT_LIMITS = RetentionLimits()
@@ -104,6 +117,9 @@ IdempotencyKey = Annotated[
     ),
 ]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Number of states of a page.")]
+PageCaption = Annotated[
+    str, Query(max_length=MAX_CAPTION_LENGTH, description="A text for below the scene's picture.")
+]
 PageMark = Annotated[
     str | None,
     Query(
@@ -208,7 +224,10 @@ def create_app(
     handlers = SceneHandlers(
         jobs, list_bases, takes_photos, max_bytes, public_path, base_name, rates, better_depth
     )
+    links = SceneLinks(None if access is None else access.token)
+    public_origin = None if access is None else access.public.origin
     add_scene_routes(app, handlers)
+    add_link_routes(app, SharedScenes(handlers, links, public_origin))
     add_status_routes(app, handlers, metrics)
     add_page_routes(app, handlers)
     return app
@@ -278,6 +297,21 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
         response_class=FileResponse,
         responses={**FILE, **refusals(404, 409)},
     )
+
+
+def add_link_routes(app: FastAPI, shared: SharedScenes) -> None:
+    """Add links to single scenes, and what those see who have one."""
+    app.add_api_route(
+        SCENES_PATH + "/{id}/link",
+        shared.get_link,
+        operation_id="get_link",
+        tags=["scenes"],
+        dependencies=[Depends(shared.handlers.check_owner)],
+        responses={**LINK, **refusals(404, 409, 422)},
+    )
+    page = SHARED_PATH + "/{id}/{key}/"
+    app.add_api_route(page, shared.get_page, include_in_schema=False)
+    app.add_api_route(page + PREVIEW, shared.get_preview, include_in_schema=False)
 
 
 def open_metrics(jobs: Jobs) -> Metrics | None:
@@ -563,9 +597,26 @@ class SceneHandlers:
                 yield state_with_files(job, place)
             await asyncio.sleep(POLL_S)
 
-    async def get_file(self, id: str, file: FileName | PagePart) -> FileResponse:
+    async def get_file(
+        self, id: str, file: FileName | PagePart, caption: PageCaption = ""
+    ) -> Response:
         """A file of a finished scene; a file that does not exist yet is made on demand."""
         job = self.find_job(id)
+        path = await self.make_file(job, file)
+        name = PurePosixPath(job.name).stem + path.suffix
+        if file == PAGE_FILE and caption:
+            page = await run_in_threadpool(path.read_bytes)
+            attachment = FileResponse(path, filename=name).headers["Content-Disposition"]
+            return HTMLResponse(
+                with_tags(page, caption), headers={"Content-Disposition": attachment}
+            )
+        return FileResponse(path, filename=name, media_type=MEDIA_TYPES.get(path.suffix, OCTETS))
+
+    async def make_file(self, job: Job, file: str) -> Path:
+        """Where a file of a finished scene lies; it is made first if it does not exist yet.
+
+        HTTPException 409 if the scene is not done, 404 if the file cannot be made.
+        """
         path = path_of_file(job, file)
         if not path.is_file():
             if job.state != "done":
@@ -578,11 +629,7 @@ class SceneHandlers:
             error = await asyncio.shield(future_error)
             if error is not None:
                 raise HTTPException(404, error)
-        return FileResponse(
-            path,
-            filename=PurePosixPath(job.name).stem + path.suffix,
-            media_type=MEDIA_TYPES.get(path.suffix, OCTETS),
-        )
+        return path
 
     async def get_page_state(self) -> dict[str, object]:
         """What the page may send: kinds of files, size limit, and networks to choose from.
@@ -643,6 +690,60 @@ class SceneHandlers:
         if job is None:
             raise HTTPException(404, "there is no such scene")
         return job
+
+
+class SharedScenes:
+    """What somebody sees who has no token but the link of one scene."""
+
+    def __init__(
+        self, handlers: SceneHandlers, links: SceneLinks, public_origin: str | None
+    ) -> None:
+        """Share scenes of the server that `handlers` serve.
+
+        Args:
+            handlers: they know the scenes.
+            links: makes and checks the links.
+            public_origin: how a browser calls the server behind its proxy, such as
+                "https://example.com"; None without a proxy.
+        """
+        self.handlers = handlers
+        self.links = links
+        self.public_origin = public_origin
+
+    async def get_link(self, id: str, request: Request, caption: PageCaption = "") -> SceneLink:
+        """The link of a finished scene: it shows the scene to whoever has it, and nothing else."""
+        self.handlers.find_finished(id)
+        path = self.links.path_of(id, caption)
+        if path is None:
+            return SceneLink(path=None)
+        return SceneLink(path=f"{self.handlers.public_path}{outer_root(request.scope)}{path}")
+
+    async def get_page(
+        self, id: str, key: str, request: Request, caption: PageCaption = ""
+    ) -> HTMLResponse:
+        """The page of one scene, as `scene.html` is, with a caption."""
+        job = self._find(id, key, caption)
+        path = await self.handlers.make_file(job, PAGE_FILE)
+        page = await run_in_threadpool(path.read_bytes)
+
+        # Programs that show previews of links fetch the picture by its full address.
+        host = request.headers["host"]
+        origin = self.public_origin or f"{request.url.scheme}://{host}"
+        root = f"{self.handlers.public_path}{outer_root(request.scope)}"
+        plain_key = self.links.key_of(id)
+        preview = f"{origin}{root}{SHARED_PATH}/{id}/{plain_key}/{PREVIEW}"
+        return HTMLResponse(with_tags(page, caption, preview), headers=SHARED_HEADERS)
+
+    async def get_preview(self, id: str, key: str) -> FileResponse:
+        """The small photo of a scene, for previews of its link."""
+        job = self._find(id, key, "")
+        return FileResponse(path_of_file(job, PREVIEW), media_type=MEDIA_TYPES[".jpg"])
+
+    def _find(self, id: str, key: str, caption: str) -> Job:
+        """The finished job that a link leads to; HTTPException 404 for a link that is none."""
+        if not self.links.is_genuine(id, key, caption):
+            raise HTTPException(404, "there is no such scene")
+        return self.handlers.find_finished(id)
 
 
 def path_of_file(job: Job, file: str) -> Path:

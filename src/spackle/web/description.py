@@ -127,6 +127,16 @@ READY: dict[int | str, dict[str, Any]] = {
         "content": {JSON: {"example": {"status": "ready"}}},
     }
 }
+LINK: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The link.",
+        "content": {
+            JSON: {
+                "example": {"path": "/shared/6f1c2a9b0d3e4f58/0f3a91c2b87d4e650f3a91c2b87d4e65/"}
+            }
+        },
+    }
+}
 DELETED: dict[int | str, dict[str, Any]] = {204: {"description": "It is deleted."}}
 FILE: dict[int | str, dict[str, Any]] = {
     200: {

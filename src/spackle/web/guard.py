@@ -24,6 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from spackle.runtime.errors import printable_line
 from spackle.web.clients import CLIENT_KEY, OPERATOR, Client
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
+from spackle.web.scene_links import SHARED_PATH
 
 LOG = logging.getLogger("spackle.web")
 # A Host header: a name or a numeric address, which is group 1, and perhaps a port.
@@ -42,6 +43,7 @@ PAGE_HEADERS = {
     "Vary": "Origin",
 }
 PREFLIGHT = "spackle.preflight"  # marks a browser's question about what it may send
+OUTER_ROOT = "spackle.outer_root"  # the root path of an app, without the token, in the scope
 STRANGER = "spackle.stranger"  # marks a request without the token, in its scope
 MAX_SEND_S = 20.0  # seconds that a client may take to read a part of an answer
 MAX_UPLOAD_BYTES = 200_000_000  # of an upload: photo and depth map
@@ -52,9 +54,10 @@ CONTENT_SECURITY_POLICY = (
     "connect-src 'self'; img-src 'self' data: blob:; media-src blob:; worker-src 'self' blob:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+POLICY_HEADER = "Content-Security-Policy"
 SECURITY_HEADERS = {
     "Cache-Control": "no-store",  # a photo is private
-    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
+    POLICY_HEADER: CONTENT_SECURITY_POLICY,
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
     "Server": "spackle",  # strangers learn no versions
@@ -125,7 +128,8 @@ class Access(NamedTuple):
         first_part = parts[1] if path.count("/") > 1 else ""  # parts[0] is before the first slash
         client = self._holder_of(first_part)
         if client is not None:
-            return {**scope, CLIENT_KEY: client, "root_path": f"{root}/{first_part}"}
+            token_root = f"{root}/{first_part}"
+            return {**scope, CLIENT_KEY: client, OUTER_ROOT: root, "root_path": token_root}
 
         # Programs send the token as a header.
         bearer = headers.get("authorization", "").removeprefix("Bearer ")
@@ -134,11 +138,12 @@ class Access(NamedTuple):
             return {**scope, CLIENT_KEY: client}
 
         # The request has no valid token. A server that was started without one lets everybody read,
-        # but nobody send photos. A server with a token only says whether it runs and is ready.
+        # but nobody send photos. A server with a token says whether it runs and is ready, and shows
+        # a scene to those who have its link.
         if self.token is None:
             if scope["method"] not in ("GET", "HEAD"):
                 raise HTTPException(401, "this page takes no photos: it was opened without a token")
-        elif path in STATUS_PATHS:
+        elif path in STATUS_PATHS or path.startswith(f"{SHARED_PATH}/"):
             return {**scope, STRANGER: True}
         else:
             raise HTTPException(401, "this needs the token that the server printed")
@@ -173,6 +178,12 @@ class Access(NamedTuple):
             if hmac.compare_digest(word.encode(), token.encode()):
                 holder = name
         return holder
+
+
+def outer_root(scope: Scope) -> str:
+    """The root path of the app, without the token that a page's addresses hold."""
+    root: str = scope.get(OUTER_ROOT, scope["root_path"])
+    return root
 
 
 def is_loopback(address: str) -> bool:
@@ -319,7 +330,10 @@ class Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update({**SECURITY_HEADERS, **site_headers})
+                answer_headers = MutableHeaders(scope=message)
+                # A scene's own page brings a policy for its scripts; see `get_shared_page`.
+                policy = answer_headers.get(POLICY_HEADER, CONTENT_SECURITY_POLICY)
+                answer_headers.update({**SECURITY_HEADERS, POLICY_HEADER: policy, **site_headers})
                 self._log_request(scope, message["status"])
                 if self.count_answer is not None:
                     self.count_answer(scope["method"], message["status"])
