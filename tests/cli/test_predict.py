@@ -28,6 +28,7 @@ from safetensors.torch import save_file
 import spackle
 from spackle.core.focal_length import focal_mm_to_px
 from spackle.pipeline import FillOptions
+from spackle.results.results_file import RESULTS_NAME
 from spackle.runtime.folders import results_folder
 from spackle.scene_fill.unet import UNet
 from spackle.weights import published_weights
@@ -277,8 +278,8 @@ def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
     write_depth(depths / "f.npy", np.zeros((HEIGHT, WIDTH), np.float32))
     result = run("predict", photos, "--depth", depths, "-o", tmp_path / "out", *SHORT)
     assert result.code == 1, result.err
-    assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "b"}  # none collide
-    for name in names_in(tmp_path / "out"):
+    assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "b", RESULTS_NAME}
+    for name in ("a.jpg", "a.png", "b"):
         assert names_in(tmp_path / "out" / name) == FILES
         assert read_ply(tmp_path / "out" / name / "scene.ply").row(0)["z"] == pytest.approx(
             6, rel=1e-3
@@ -301,7 +302,8 @@ def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> No
         write_depth(tmp_path / "d.npy"),
     )
     result = run("predict", *given, "-o", out, *SHORT)
-    assert (result.code, names_in(out)) == (0, {"a", "b", "wild1", "wild2"}), result.err
+    folders = {"a", "b", "wild1", "wild2"}
+    assert (result.code, names_in(out)) == (0, {*folders, RESULTS_NAME}), result.err
     video, scene = (out / "NAME" / name for name in ("video.mp4", "scene.ply"))
     assert result.lines[-1] == f"Look at {video}, or into the scene: spackle view {scene}"
     refuses(
@@ -320,12 +322,9 @@ def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> Non
 
     def redone(*options: object) -> str:
         """The names of the photos that were predicted again."""
-        result = predicted(photos, depth, out, *options)
-        done = {
-            line[0]
-            for line in result.lines
-            if line.endswith("done already (--overwrite does it again)")
-        }
+        result = predicted(photos, depth, out, "--json", *options)
+        lines = [json.loads(line) for line in result.out.splitlines()]
+        done = {Path(line["folder"]).name for line in lines if "done_already" in line}
         return "".join(sorted(set("abc") - done))
 
     assert redone() == "abc"

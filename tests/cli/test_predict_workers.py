@@ -17,6 +17,8 @@ from helpers.command import SHORT, Run, names_in, report_of, run
 from helpers.photos import HEIGHT, WIDTH, metres, write_depth, write_photo
 from helpers.systems import needs_posix_signals
 
+from spackle.results.results_file import RESULTS_NAME
+
 FILES = {"scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
 
 
@@ -50,8 +52,13 @@ def predict(place: Path, out: Path, *options: object) -> Run:
 
 
 def content(out: Path) -> Iterator[Any]:
-    """All files; of a report all but its times, which are in `files`, too."""
-    for folder in sorted(out.iterdir()):
+    """All files; of reports and of results.jsonl all but the times and the sizes of reports."""
+    for line in (out / RESULTS_NAME).read_text().splitlines():
+        result = json.loads(line)
+        assert result.pop("seconds") >= 0
+        assert result.get("files", {"report.json": 1000}).pop("report.json") > 0
+        yield result
+    for folder in sorted(path for path in out.iterdir() if path.is_dir()):
         assert names_in(folder) == FILES
         report = report_of(folder)
         assert report.pop("seconds")["total"] > 0
@@ -78,9 +85,7 @@ def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(
     (out / "c" / "report.json").unlink()
     times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "ac"}
     again = predict(place, out, "--workers", 2)
-    assert [line for line in again.lines if "done already" in line] == [
-        "a.png: done already (--overwrite does it again)"
-    ]
+    assert "1 of 3 photos done already (--overwrite does them again)" in again.lines
     assert [(out / name / "scene.ply").stat().st_mtime_ns > times[name] for name in "ac"] == [
         False,
         True,

@@ -12,10 +12,11 @@ import glob
 import os
 import shlex
 import socket
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import spackle
 from spackle.bases.open import BaseError
@@ -32,17 +33,28 @@ from spackle.results.photo_folder import (
     predict_photo,
     read_earlier_report,
 )
+from spackle.results.results_file import ResultsFile
 from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import check_file
 from spackle.runtime.folders import results_folder
 from spackle.runtime.kernels import is_compiled
 from spackle.runtime.plugins import plugin_file
-from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
+from spackle.runtime.progress import (
+    BufferedReporter,
+    Reporter,
+    catch_stop_signals,
+    pluralized,
+)
 from spackle.runtime.worker_options import WorkerOptions
 from spackle.runtime.workers import parallel_map, torch_threads
 from spackle.video.frames import video_problem
 from spackle.weights import installed_weights
+
+# What became of a photo, in results.jsonl.
+OK = "ok"
+FAILED = "failed"
+STATE_DIGITS = 16  # hexadecimal; enough to tell two states of a photo's files apart
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -94,13 +106,14 @@ class NamedPhoto(NamedTuple):
 
     path: Path
     name: str
+    number: int  # its place among the photos of the run, from 0
 
 
 class PhotoResult(NamedTuple):
     """What a worker says about a photo."""
 
-    file_name: str
-    failed: bool
+    photo: NamedPhoto
+    line: Mapping[str, Any]  # of results.jsonl
     messages: Sequence[str | Mapping[str, object]]  # log lines, and results for JSON, in order
 
 
@@ -149,7 +162,7 @@ def find_photos(
                 f"{photo}: {other.path} has the same name: "
                 "predict them in two runs, each with its own `output`"
             )
-        named[name.casefold()] = NamedPhoto(photo, name)
+        named[name.casefold()] = NamedPhoto(photo, name, len(named))
     return list(named.values())
 
 
@@ -224,23 +237,12 @@ def predict_photos(
             pipeline=pipeline,
             verbose=reporter.verbose,
         )
-        unfinished = predictor.unfinished(photos, reporter)
-        # A single photo is not worth a worker's start.
-        if workers.in_this_process or is_single:
-            failure_count = _predict_in_this_process(
-                predictor, unfinished, workers.threads, reporter
-            )
+        if is_single:
+            with torch_threads(workers.threads):
+                predictor.predict(photos[0], reporter)
+            failure_count = 0
         else:
-            # Each worker opens a predictor of its own, because networks do not travel between
-            # processes.
-            failure_count = _predict_by_workers(
-                functools.partial(Predictor.open, output, options, shared_digest, reporter.verbose),
-                list(unfinished),
-                photo_count=len(photos),
-                workers=workers,
-                output=output,
-                reporter=reporter,
-            )
+            failure_count = _predict_many(photos, predictor, workers, reporter)
 
     if failure_count:
         reporter.log(f"{failure_count} of {len(photos)} photos failed")
@@ -251,19 +253,50 @@ def predict_photos(
     return failure_count
 
 
-def _predict_in_this_process(
-    predictor: Predictor, photos: Iterable[NamedPhoto], threads: int, reporter: Reporter
+def _predict_many(
+    photos: Sequence[NamedPhoto],
+    predictor: Predictor,
+    workers: WorkerOptions,
+    reporter: Reporter,
 ) -> int:
-    """Predict one photo after the other with a number of threads; returns how many failed.
+    """Predict the photos that have no results yet, and keep results.jsonl; returns how many failed.
 
-    A second process would hold torch and the base's network in memory twice.
+    The caller has locked the folder of the results.
     """
-    failure_count = 0
-    with torch_threads(threads):
-        for photo in photos:
-            if not predictor.predict(photo, reporter):
+    output = predictor.output
+    with ResultsFile(output, [photo.name for photo in photos]) as results_file:
+        unfinished = predictor.unfinished(photos, results_file, reporter)
+        if workers.in_this_process:
+            # A second process would hold torch and the base's network in memory twice.
+            lines = _predict_in_this_process(predictor, unfinished, workers.threads, reporter)
+        else:
+            # Each worker opens a predictor of its own, because networks do not travel between
+            # processes.
+            open_predictor = functools.partial(
+                Predictor.open,
+                output,
+                predictor.options,
+                predictor.shared_digest,
+                reporter.verbose,
+            )
+            lines = _predict_by_workers(
+                open_predictor, unfinished, len(photos), workers, output, reporter
+            )
+        failure_count = 0
+        for photo, line in lines:
+            results_file.add(photo.number, line)
+            if line["status"] == FAILED:
                 failure_count += 1
     return failure_count
+
+
+def _predict_in_this_process(
+    predictor: Predictor, photos: Iterable[NamedPhoto], threads: int, reporter: Reporter
+) -> Iterator[tuple[NamedPhoto, Mapping[str, Any]]]:
+    """Predict one photo after the other with a number of threads; yields the line of each."""
+    with torch_threads(threads):
+        for photo in photos:
+            yield photo, predictor.predict(photo, reporter)
 
 
 def _say_where_to_look(folder: Path, options: PredictOptions, reporter: Reporter) -> None:
@@ -283,7 +316,7 @@ def _predict_by_workers(
     workers: WorkerOptions,
     output: Path,
     reporter: Reporter,
-) -> int:
+) -> Iterator[tuple[NamedPhoto, Mapping[str, Any]]]:
     """Predict photos by several processes, and print the messages about each finished photo.
 
     Args:
@@ -294,16 +327,15 @@ def _predict_by_workers(
         output: the folder of all results.
         reporter: gets messages and progress.
 
-    Returns:
-        The number of photos that failed.
+    Yields:
+        Each finished photo, with its line of results.jsonl.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once the photos in progress are done.
     """
     # Workers take seconds to start, so none is started for nothing.
     if not unfinished:
-        return 0
-    failure_count = 0
+        return
     finished_before = photo_count - len(unfinished)
     finished_count = finished_before
     with (
@@ -320,9 +352,8 @@ def _predict_by_workers(
                     reporter.log(message)
                 else:
                     reporter.result(message)
-            if result.failed:
-                failure_count += 1
-            report_step(finished_count, result.file_name)
+            yield result.photo, result.line
+            report_step(finished_count, result.photo.path.name)
             if is_stopping():
                 break
 
@@ -330,7 +361,6 @@ def _predict_by_workers(
     if finished_count < photo_count:
         reporter.log("stopped; the same command resumes from here")
         raise KeyboardInterrupt
-    return failure_count
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -369,21 +399,25 @@ class Predictor:
         """Predict a photo in a worker process, and keep the messages for the main process."""
         reporter = BufferedReporter(self.verbose)
         # A worker that died may have finished the photo without saying so.
-        if self.is_done(photo):
-            return PhotoResult(photo.path.name, False, reporter.said)
-        succeeded = self.predict(photo, reporter)
-        return PhotoResult(photo.path.name, not succeeded, reporter.said)
+        line = self.finished_line(photo)
+        if line is None:
+            line = self.predict(photo, reporter)
+        return PhotoResult(photo, line, reporter.said)
 
-    def predict(self, photo: NamedPhoto, reporter: Reporter) -> bool:
-        """Predict a photo and return True, or log the error and return False.
+    def predict(self, photo: NamedPhoto, reporter: Reporter) -> Mapping[str, Any]:
+        """Predict a photo, or log why it cannot be; returns its line for results.jsonl.
 
         An error ends the run, as an InputError, if the photo is the only one, or if the base fails
         for every photo.
         """
         folder = self.output / photo.name
+        start = time.perf_counter()
         try:
+            facts = self._input_facts(photo)
             request = self.request_digest(photo)
-            predict_photo(photo.path, folder, self.pipeline, reporter, self.options.photo, request)
+            report = predict_photo(
+                photo.path, folder, self.pipeline, reporter, self.options.photo, request
+            )
         except InputError as error:
             # A BaseError means that the base fails for every photo. Any other error is that of one
             # photo, and must not cost the user the photos after it.
@@ -391,56 +425,169 @@ class Predictor:
                 raise
             reporter.log(f"error: {error}")
             reporter.result({"folder": folder, "error": str(error)})
-            return False
-        return True
+            return {
+                "name": photo.name,
+                "photo": str(photo.path),
+                "status": FAILED,
+                "seconds": round(time.perf_counter() - start, 3),
+                "error": str(error),
+            }
+        return self._line_of(
+            photo,
+            seconds=time.perf_counter() - start,
+            files=report.files,
+            # A result that is not for good is made again in the next run.
+            input_facts=None if report.request is None else facts,
+        )
 
-    def unfinished(self, photos: Iterable[NamedPhoto], reporter: Reporter) -> Iterator[NamedPhoto]:
-        """The photos without complete results; logs each photo that is skipped."""
+    def _line_of(
+        self,
+        photo: NamedPhoto,
+        *,
+        seconds: float,
+        files: Mapping[str, Mapping[str, Any]],
+        input_facts: Sequence[object] | None,
+    ) -> Mapping[str, Any]:
+        """The line of results.jsonl for a photo with results.
+
+        Args:
+            photo: the photo.
+            seconds: that it took.
+            files: the records of its files in its report.
+            input_facts: what `_input_facts` returned before the work; None: predict again next
+                time.
+        """
+        folder = self.output / photo.name
+        sizes = {name: record["bytes"] for name, record in files.items()}
+        sizes[REPORT_NAME] = (folder / REPORT_NAME).stat().st_size
+        return {
+            "name": photo.name,
+            "photo": str(photo.path),
+            "status": OK,
+            "seconds": round(seconds, 3),
+            "files": sizes,  # in bytes
+            "state": None if input_facts is None else self._state_of(folder, sizes, input_facts),
+        }
+
+    def unfinished(
+        self, photos: Sequence[NamedPhoto], results_file: ResultsFile, reporter: Reporter
+    ) -> list[NamedPhoto]:
+        """The photos without complete results; says how many others there are.
+
+        Photos with results about which `results_file` knows nothing get a line in it.
+        """
+        unfinished = []
         for photo in photos:
-            if self.is_done(photo):
-                reporter.log(f"{photo.path.name}: done already (`overwrite` does it again)")
-                reporter.result({"folder": self.output / photo.name, "done_already": True})
-            else:
-                yield photo
+            earlier_line = results_file.line_of(photo.number)
+            line = self.finished_line(photo, earlier_line)
+            if line is None:
+                unfinished.append(photo)
+                continue
+            if line is not earlier_line:
+                results_file.add(photo.number, line)
+            reporter.result({"folder": self.output / photo.name, "done_already": True})
+        finished_count = len(photos) - len(unfinished)
+        if finished_count:
+            reporter.log(
+                f"{finished_count} of {pluralized(len(photos), 'photo')} done already "
+                "(`overwrite` does them again)"
+            )
+        return unfinished
 
-    def is_done(self, photo: NamedPhoto) -> bool:
-        """Whether an earlier run with the same input and options has written all results."""
+    def finished_line(
+        self, photo: NamedPhoto, earlier_line: Mapping[str, Any] | None = None
+    ) -> Mapping[str, Any] | None:
+        """The line of a photo that has all results of the same input and options; else None.
+
+        Args:
+            photo: the photo.
+            earlier_line: what an earlier run wrote about it, if anything. If it fits the photo's
+                files, it is returned itself.
+        """
         # Who names a single photo wants it predicted now.
         if self.is_single or self.options.overwrite:
-            return False
+            return None
         folder = self.output / photo.name
-        earlier_report = read_earlier_report(folder)
-        if not earlier_report:
-            return False
         try:
-            request = self.request_digest(photo)
+            facts = self._input_facts(photo)
+            # Reading photo and results takes long, so sizes and times are looked at first.
+            if earlier_line and facts is not None:
+                state = self._state_of(folder, earlier_line.get("files", {}), facts)
+                if state is not None and state == earlier_line.get("state"):
+                    return earlier_line
+
+            report = read_earlier_report(folder)
+            if not report or report.get("request") != self.request_digest(photo):
+                return None
         except InputError:
-            return False  # a file is missing, which `predict` will report
+            return None  # a file is missing, which `predict` will report
 
         # A report may be whole although other files are damaged or were not copied. So each file is
         # compared with the size and digest that the report says.
-        has_same_request = earlier_report.get("request") == request
-        return has_same_request and matches_records(
-            folder, REPORT_NAME, earlier_report.get("files")
-        )
+        files: Any = report.get("files")
+        if not matches_records(folder, REPORT_NAME, files):
+            return None
+        seconds = report["seconds"]["total"]
+        return self._line_of(photo, seconds=seconds, files=files, input_facts=facts)
+
+    def _input_facts(self, photo: NamedPhoto) -> list[tuple[int, int]] | None:
+        """Size and time of last change of the photo and of what belongs to it.
+
+        None if a file cannot be looked at, which `request_digest` reports. InputError if the depth
+        map is missing.
+        """
+        try:
+            facts = [os.stat(file) for file, _ in self._input_files(photo)]
+        except (OSError, ValueError):  # a ValueError is that of a name with a null character
+            return None
+        return [(fact.st_size, fact.st_mtime_ns) for fact in facts]
+
+    def _state_of(
+        self, folder: Path, names: Iterable[str], input_facts: Sequence[object]
+    ) -> str | None:
+        """A text that changes with options, and with sizes and times of inputs and results.
+
+        Args:
+            folder: of the photo's results.
+            names: of the files in it.
+            input_facts: those of the photo.
+
+        Returns:
+            The text; None if a file is missing.
+        """
+        output_facts = []
+        for name in names:
+            try:
+                fact = os.stat(folder / name)
+            except OSError:
+                return None
+            # A copied file may keep the time of its content (mtime), but not that of its entry.
+            output_facts.append((fact.st_size, fact.st_mtime_ns, fact.st_ctime_ns))
+        return json_digest([self.shared_digest, input_facts, output_facts])[:STATE_DIGITS]
 
     def request_digest(self, photo: NamedPhoto) -> str:
         """A digest of all that a photo's results depend on.
 
         InputError if the photo or its depth map is missing.
         """
-        # A fingerprint says which content a file has; the second argument names the file in an
-        # error message.
-        fingerprints = [file_fingerprint(photo.path, "photo")]
+        # A fingerprint says which content a file has.
+        fingerprints = [file_fingerprint(file, kind) for file, kind in self._input_files(photo)]
+        return json_digest([self.shared_digest, *fingerprints])
+
+    def _input_files(self, photo: NamedPhoto) -> Iterator[tuple[Path, str]]:
+        """Yield the photo, its depth map and calibration, each with what messages call it.
+
+        InputError if a depth map is missing.
+        """
+        yield photo.path, "photo"
         depth = self.options.scene.base.depth
         if isinstance(depth, Path):  # a depth map, or a folder with a map for each photo
             depth_file = find_depth_file(depth, photo.path)
-            fingerprints.append(file_fingerprint(depth_file, "depth map"))
+            yield depth_file, "depth map"
             # The calibration beside a depth map gives its numbers their unit.
             for calibration in calibration_candidates(depth_file):
                 if calibration.is_file():
-                    fingerprints.append(file_fingerprint(calibration, "calibration"))
-        return json_digest([self.shared_digest, *fingerprints])
+                    yield calibration, "calibration"
 
 
 def options_digest(options: PredictOptions) -> str:

@@ -1,0 +1,74 @@
+"""`spackle predict` over many photos: names, results.jsonl, and what a rerun does."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.command import Run, names_in, run
+from helpers.flat_base import QUICK, write_small_photos
+
+import spackle.results.many_photos as many_photos
+from spackle.results.results_file import RESULTS_NAME
+
+
+def predict(photos: Path, out: Path, *options: object) -> Run:
+    return run("predict", photos, "-o", out, *QUICK, *options)
+
+
+def results_of(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / RESULTS_NAME).read_text().splitlines()]
+
+
+def test_results_are_listed_and_known_without_reading_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = write_small_photos(tmp_path / "photos", "a.png", "b.png", "c.png")
+    (photos / "b.png").write_text("no photo")
+    out = tmp_path / "out"
+    assert predict(photos, out).code == 1
+    first, second, third = results_of(out)
+    assert [first["name"], second["name"], third["name"]] == ["a", "b", "c"]
+    assert (first["status"], second["status"], third["status"]) == ("ok", "failed", "ok")
+    assert first["photo"] == str(photos / "a.png")
+    assert first["seconds"] > 0
+    sizes = {name: (out / "a" / name).stat().st_size for name in names_in(out / "a")}
+    assert first["files"] == sizes
+    assert "b.png" in second["error"]
+
+    # A rerun reads only the failed photo again; the others are known by size and time.
+    read: list[str] = []
+    fingerprint = many_photos.file_fingerprint
+
+    def noted(file: Path, kind: str) -> str:
+        if kind == "photo":
+            read.append(file.name)
+        return fingerprint(file, kind)
+
+    monkeypatch.setattr(many_photos, "file_fingerprint", noted)
+    again = predict(photos, out)
+    assert "2 of 3 photos done already (--overwrite does them again)" in again.lines
+    assert set(read) == {"b.png"}
+    assert [line | {"seconds": 0} for line in results_of(out)] == [
+        line | {"seconds": 0} for line in (first, second, third)
+    ]
+
+    # A photo that was only touched is read, but not predicted again; its line is written anew.
+    # Nor does it need results.jsonl.
+    scene = (out / "a" / "scene.ply").stat()
+    os.utime(photos / "a.png")
+    predict(photos, out)
+    assert set(read) == {"a.png", "b.png"}
+    (out / RESULTS_NAME).unlink()
+    predict(photos, out)
+    assert (out / "a" / "scene.ply").stat().st_mtime_ns == scene.st_mtime_ns
+    assert [line["status"] for line in results_of(out)] == ["ok", "failed", "ok"]
+
+
+def test_one_photo_that_is_named_has_no_list(tmp_path: Path) -> None:
+    photos = write_small_photos(tmp_path, "a.png")
+    assert predict(photos / "a.png", tmp_path / "out").code == 0
+    assert names_in(tmp_path / "out") == {"a"}
