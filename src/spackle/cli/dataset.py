@@ -19,7 +19,7 @@ from spackle.cli.options import (
     VerboseOption,
     WorkersOption,
 )
-from spackle.runtime.declared_options import SharpTrajectory
+from spackle.runtime.declared_options import KeptFiles, SharpTrajectory
 
 dataset = typer.Typer(
     help="Build and inspect training data: views with holes, and targets.", no_args_is_help=True
@@ -28,6 +28,9 @@ dataset = typer.Typer(
 
 DatasetArgument = Annotated[
     str, typer.Argument(metavar="DATASET", help="A folder, or an address (s3://…).")
+]
+DatasetsArgument = Annotated[
+    list[str], typer.Argument(metavar="DATASET...", help="Folders, or addresses (s3://…).")
 ]
 
 
@@ -130,6 +133,13 @@ def dataset_build(
     shard_size: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")
     ] = 50,
+    keep: Annotated[
+        KeptFiles,
+        typer.Option(
+            help="targets: leave out what the photo's Gaussians give again; training reads the "
+            "same from a fraction of the pictures."
+        ),
+    ] = "all",
     device: DeviceOption = "auto",
     verbose: VerboseOption = False,
 ) -> None:
@@ -168,6 +178,7 @@ def dataset_build(
         threads=threads,
         ray=ray,
         shard_size=shard_size,
+        keep=keep,
     )
     # Ctrl-C or SIGTERM: finished photos are saved, and the same command resumes the build.
     if build_dataset(photos, output, options, CommandReporter(verbose)) == "stopped":
@@ -175,25 +186,29 @@ def dataset_build(
 
 
 @dataset.command("info")
-def dataset_info(location: DatasetArgument) -> None:
-    """Print a dataset's counts, sizes, holes of each view, and configuration."""
+def dataset_info(locations: DatasetsArgument) -> None:
+    """Print counts, sizes, holes of each view, and configuration of datasets."""
     # Imported here, because the help must not wait for torch.
     from rich.console import Console
 
     from spackle.paper.dataset.inspect import show_info
 
-    show_info(location, Console(highlight=False))
+    for location in locations:
+        show_info(location, Console(highlight=False))
 
 
 @dataset.command("verify")
-def dataset_verify(location: DatasetArgument) -> None:
-    """Read every byte and name each damaged sample; exit code 1 if any is damaged."""
+def dataset_verify(locations: DatasetsArgument) -> None:
+    """Read every byte and name each damaged sample; exit code 1 if any is damaged.
+
+    Of several datasets it also says whether training can take them as one.
+    """
     # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
-    from spackle.paper.dataset.inspect import verify_dataset
+    from spackle.paper.dataset.inspect import verify_datasets
 
-    # The damaged samples have been named already; scripts see the exit code.
-    if verify_dataset(location, CommandReporter()):
+    # The problems have been named already; scripts see the exit code.
+    if verify_datasets(locations, CommandReporter()):
         raise typer.Exit(1)
 
 

@@ -28,6 +28,9 @@ FillTexture = Literal["auto", "network", "exemplar", "lama", "none"]
 # One set of aux Gaussians for all views; one set for each view; or one set for each view by the
 # paper's method alone, without what Spackle adds to it.
 FillMode = Literal["scene", "view", "paper"]
+# What a dataset keeps of its views. "targets" leaves out what the photo's Gaussians give again: the
+# rendered views. Of a target only the holes are kept, because elsewhere it is the view.
+KeptFiles = Literal["all", "targets"]
 VideoFormatName = Literal["mp4", "webm", "gif", "webp"]
 # For a view of another aspect ratio than the video's: black margins, blurred margins, or cropping.
 Fit = Literal["pad", "blur", "crop"]

@@ -366,6 +366,8 @@ def test_the_papers_recipe_learns_from_a_dataset(whole: Path, tmp_path: Path) ->
         1,
         "sharp-decoder",
     )
+    (dataset,) = report["datasets"]
+    assert (dataset["photos"], dataset["sha256"]) == (5, load_manifest(whole).digest)
     # Every view of the three photos that are left, those without a hole and small ones, too.
     assert report["samples"] == report["samples"] | {"kind": "whole views", "train": 12}
     assert report["hole_psnr"]["untrained"] + 3 < report["hole_psnr"]["colours of the targets"]

@@ -189,7 +189,13 @@ class SampleMaker:
             "trajectory": {"kind": kind, "disparity": disparity},
         }
         return pack_sample(
-            file.key, resize_photo(photo).rgb, views, targets, facts, encoded_base=encoded_base
+            file.key,
+            resize_photo(photo).rgb,
+            views,
+            targets,
+            facts,
+            encoded_base=encoded_base,
+            keep=options.keep,
         )
 
 

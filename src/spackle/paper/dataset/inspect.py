@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from spackle.formats import save_png
 from spackle.formats.png import contact_sheet
+from spackle.paper.dataset.joined import JoinedDataset
 from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
 from spackle.paper.dataset.shards import (
     DatasetFiles,
@@ -62,11 +63,27 @@ def show_info(location: str, console: Console) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
 
-def verify_dataset(location: str, reporter: Reporter) -> int:
-    """Read every byte of a dataset and log each problem; returns the number of problems.
+def verify_datasets(locations: Sequence[str], reporter: Reporter) -> int:
+    """Read every byte of some datasets and log each problem; returns the number of problems.
 
-    InputError if the dataset has no readable manifest, which lists what should be there.
+    Several datasets must also belong together, so that training can take them as one. InputError
+    if a dataset has no readable manifest, which lists what should be there.
     """
+    problem_count = 0
+    for location in locations:
+        problem_count += _verify_dataset(location, reporter)
+    if problem_count == 0 and len(locations) > 1:
+        try:
+            photos = pluralized(len(JoinedDataset(locations)), "photo")
+            reporter.log(f"{len(locations)} datasets make one of {photos}")
+        except InputError as error:
+            reporter.log(str(error))
+            problem_count += 1
+    return problem_count
+
+
+def _verify_dataset(location: str, reporter: Reporter) -> int:
+    """Read every byte of a dataset and log each problem; returns the number of problems."""
     manifest = load_manifest(location)
     problem_count = 0
     with reporter.stage("verify") as progress:

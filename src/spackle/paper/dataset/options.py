@@ -23,6 +23,7 @@ from spackle.inpaint import (
 from spackle.paper.dataset.photos import PhotoFile
 from spackle.paper.dataset.views import COMPLETIONS
 from spackle.residual import MASK_THRESHOLD
+from spackle.runtime.declared_options import KeptFiles
 from spackle.runtime.digests import file_fingerprint, json_digest
 from spackle.runtime.errors import InputError
 from spackle.runtime.plugins import check_name_or_plugin, plugin_digests
@@ -49,6 +50,7 @@ class DatasetOptions:
     threads: int = 2  # threads per process
     ray: str | None = None  # address of a Ray cluster, whose machines make the samples
     shard_size: int = 50  # photos per shard, that is, per tar file
+    keep: KeptFiles = "all"  # "targets": only what training cannot make again
 
     def open_inpainter(self) -> Inpainter | None:
         """Open the inpainter, which paints holes; None if holes are completed in another way.
@@ -171,6 +173,8 @@ def dataset_configuration(
         depth_reading["depth_kind"] = base.depth_kind
     if base.depth_unit is not None:
         depth_reading["depth_unit"] = base.depth_unit
+    # A dataset with all files says nothing about them.
+    kept_files = {} if options.keep == "all" else {"keep": options.keep}
     return {
         "spackle": spackle.__version__,
         "photos": {
@@ -196,6 +200,7 @@ def dataset_configuration(
         "inpainter": completion,
         "shard_size": options.shard_size,
         "threads": options.threads,
+        **kept_files,
     }
 
 

@@ -15,9 +15,11 @@ import tarfile
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
+from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
 from spackle.formats.camera_files import camera_from_json
 from spackle.paper.dataset.encoding import (
@@ -32,7 +34,9 @@ from spackle.paper.dataset.encoding import (
     encode_rgb,
 )
 from spackle.paper.dataset.views import ViewStack
+from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
+from spackle.runtime.declared_options import KeptFiles
 from spackle.runtime.errors import as_input_error
 
 END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)  # two empty blocks end a tar archive
@@ -60,6 +64,7 @@ def pack_sample(
     facts: Mapping[str, Any],
     *,
     encoded_base: bytes,
+    keep: KeptFiles = "all",
 ) -> bytes:
     """Pack a photo with its views for a tar archive.
 
@@ -75,6 +80,8 @@ def pack_sample(
         facts: become part of the JSON; they must hold "threshold" (the opacity below which a pixel
             is masked) and "trajectory".
         encoded_base: the photo's Gaussians, by `encode_gaussians`.
+        keep: "targets" leaves out rgb, alpha and depth, and makes the target black outside of the
+            mask.
     """
     view_files: list[tuple[str, bytes]] = []  # names and contents
     view_facts: list[dict[str, Any]] = []
@@ -83,13 +90,17 @@ def pack_sample(
         alpha = stack.alpha[index]
         mask = stack.mask[index]
         depth_png, depth_range = encode_depth(stack.depth[index], alpha)
-        pictures = {
-            "rgb": encode_rgb(stack.rgb[index]),
-            "target": encode_rgb(targets[index]),
-            "mask": encode_mask(mask),
-            "alpha": encode_alpha(alpha, mask, facts["threshold"]),
-            "depth": depth_png,
-        }
+        if keep == "targets":
+            hole_colors = torch.where(mask[..., None], targets[index], 0.0)
+            pictures = {"target": encode_rgb(hole_colors), "mask": encode_mask(mask)}
+        else:
+            pictures = {
+                "rgb": encode_rgb(stack.rgb[index]),
+                "target": encode_rgb(targets[index]),
+                "mask": encode_mask(mask),
+                "alpha": encode_alpha(alpha, mask, facts["threshold"]),
+                "depth": depth_png,
+            }
         for kind, content in pictures.items():
             view_files.append((f"{key}.{index:02d}.{kind}.png", content))
         hole_ratio = float(mask.double().mean())
@@ -156,34 +167,104 @@ class PhotoGroup:
         """The number of views."""
         return len(self.holes)
 
+    @property
+    def has_renderings(self) -> bool:
+        """Whether the rendered views are stored; otherwise the Gaussians give them again."""
+        return f"{self.key}.00.rgb.png" in self.files
+
     def view(self, index: int) -> DatasetView:
-        """Decode one view, by its number; InputError if a file is missing or damaged."""
+        """Decode one view, by its number; InputError if a file is missing or damaged.
+
+        A rendering that is not stored is made again, on the CPU. It has the stored bits if the
+        dataset was built on a CPU, too.
+        """
+        camera = self.camera(index)
         with as_input_error(f"{self.where}: view {index}", "cannot be read: {reason}"):
-            facts = self.facts["views"][index]
-            near, far = facts["depth_range"]
-            rendering = Rendering(
-                decode_rgb(self._picture(index, "rgb")),
-                decode_depth(self._picture(index, "depth"), near, far),
-                decode_alpha(self._picture(index, "alpha")),
-            )
+            mask = decode_mask(self._picture(index, "mask"))
+            if self.has_renderings:
+                rendering = self._stored_rendering(index)
+            else:
+                rendering = self._render_again(camera, mask)
             view = DatasetView(
                 key=self.key,
                 index=index,
-                photo=decode_rgb(self.files[f"{self.key}.photo.png"]),
-                photo_camera=camera_from_json(self.facts["photo_camera"], self.where),
-                camera=camera_from_json(facts, self.where),
+                photo=self.photo,
+                photo_camera=self.photo_camera,
+                camera=camera,
                 rendering=rendering,
-                mask=decode_mask(self._picture(index, "mask")),
-                target=decode_rgb(self._picture(index, "target")),
+                mask=mask,
+                target=self.target(index, rendering.rgb),
             )
             check_sizes(view)
             return view
+
+    @functools.cached_property
+    def photo(self) -> Tensor:
+        """[h, w, 3] sRGB of the photo at its working size; InputError for a damaged file."""
+        with as_input_error(f"{self.where}: photo", "cannot be read: {reason}"):
+            return decode_rgb(self.files[f"{self.key}.photo.png"])
+
+    @property
+    def photo_camera(self) -> Camera:
+        """The photo's camera; InputError if the facts have none."""
+        with as_input_error(f"{self.where}: photo", "cannot be read: {reason}"):
+            return camera_from_json(self.facts["photo_camera"], self.where)
+
+    def camera(self, index: int) -> Camera:
+        """The camera of a view, by its number; InputError if the facts have none."""
+        with as_input_error(f"{self.where}: view {index}", "cannot be read: {reason}"):
+            return camera_from_json(self.facts["views"][index], self.where)
+
+    def target(self, index: int, rendered_rgb: Tensor) -> Tensor:
+        """[H, W, 3] sRGB that a view should show; InputError if a file is missing or damaged.
+
+        Args:
+            index: the view's number.
+            rendered_rgb: [H, W, 3] sRGB of the view without completion. It is the target outside
+                of the holes, if only the holes are stored.
+        """
+        with as_input_error(f"{self.where}: view {index}", "cannot be read: {reason}"):
+            target = decode_rgb(self._picture(index, "target"))
+            if target.shape != rendered_rgb.shape:
+                raise ValueError("the target has another size than the view")
+            if self.has_renderings:
+                return target
+            mask = decode_mask(self._picture(index, "mask"))
+            # Rounded as a stored target is, so that both kinds of datasets teach the same.
+            rounded_rgb = to_uint8(rendered_rgb).float().cpu() / 255
+            return torch.where(mask[..., None], target, rounded_rgb)
 
     @functools.cached_property
     def base(self) -> Gaussians:
         """The photo's Gaussians, decoded when first asked for; InputError for a damaged file."""
         with as_input_error(f"{self.where}: Gaussians", "cannot be read: {reason}"):
             return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
+
+    def _stored_rendering(self, index: int) -> Rendering:
+        """What the photo's Gaussians show in a view, from its three pictures."""
+        near, far = self.facts["views"][index]["depth_range"]
+        return Rendering(
+            decode_rgb(self._picture(index, "rgb")),
+            decode_depth(self._picture(index, "depth"), near, far),
+            decode_alpha(self._picture(index, "alpha")),
+        )
+
+    @torch.no_grad()
+    def _render_again(self, camera: Camera, mask: Tensor) -> Rendering:
+        """What the photo's Gaussians show in a view, rounded as stored pictures are.
+
+        Args:
+            camera: the view's.
+            mask: [H, W] bool: the view's holes, which are stored.
+        """
+        rendering = CpuRenderer().render(self.base, camera)
+        alpha_png = encode_alpha(rendering.alpha, mask, self.facts["threshold"])
+        depth_png, (near, far) = encode_depth(rendering.depth, rendering.alpha)
+        return Rendering(
+            decode_rgb(encode_rgb(rendering.rgb)),
+            decode_depth(depth_png, near, far),
+            decode_alpha(alpha_png),
+        )
 
     def _picture(self, index: int, kind: str) -> bytes:
         """The PNG of a view; KeyError if it is missing.

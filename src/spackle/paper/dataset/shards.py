@@ -72,6 +72,11 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
         return sum(len(sample.holes) for _, sample in self.samples)
 
     @property
+    def views_per_photo(self) -> int:
+        """The number of views of each photo; 0 without photos."""
+        return next((len(sample.holes) for _, sample in self.samples), 0)
+
+    @property
     def size(self) -> int:
         """The size of all shards in bytes."""
         return sum(shard.size for shard in self.shards)

@@ -207,39 +207,35 @@ class DirectFt(ViewTask):
             InputError: the recipe, the checkpoint or the dataset cannot be used.
         """
         super().__init__(recipe, device)
-        dataset_location = self._check_recipe(recipe)
+        self._check_recipe(recipe)
         self.sharp_checkpoint = self._find_checkpoint(checkpoint)
-        self.files = open_pseudo_dataset(dataset_location)
-        self._check_base_of_dataset(dataset_location)
+        self.dataset = open_pseudo_dataset(recipe.data.pseudo)
+        self._check_base_of_dataset()
 
         # What the training loop asks of every task: a digest of the data, and numbers of items.
-        self.training_photos, self.validation_photos = split_photos(self.files, recipe.data)
+        self.training_photos, self.validation_photos = split_photos(self.dataset, recipe.data)
         self.digest = short_digest(
-            (self.files.manifest.digest, self.training_photos, self.validation_photos)
+            (self.dataset.digest, self.training_photos, self.validation_photos)
         )
         self.items = len(self.training_photos)
         self.validation_items = len(self.validation_photos)
         self.items_per_step = recipe.optim.batch // VIEWS_PER_PHOTO
 
     @staticmethod
-    def _check_recipe(recipe: Recipe) -> Path:
-        """Check that a recipe names a dataset as its only data; returns where the dataset lies.
-
-        InputError if there are other data or initial weights, or the batch cannot be divided into
-        photos.
-        """
+    def _check_recipe(recipe: Recipe) -> None:
+        """InputError if a recipe names other data than datasets, or initial weights, or a batch
+        that cannot be divided into photos."""
         data = recipe.data
         if recipe.optim.batch % VIEWS_PER_PHOTO:
             raise InputError(
                 f"optim.batch={recipe.optim.batch}: give a multiple of {VIEWS_PER_PHOTO} views"
             )
         has_other_data = recipe.init or data.photos or data.rgbd or data.stereo
-        if data.pseudo is None or has_other_data:
+        if not data.pseudo or has_other_data:
             raise InputError(
                 "`method` direct-ft learns only from data.pseudo, a dataset of `spackle dataset "
                 "build` with `base` sharp: leave out init and other data"
             )
-        return data.pseudo
 
     @staticmethod
     def _find_checkpoint(checkpoint: Path | None) -> SourceCheckpoint:
@@ -256,31 +252,33 @@ class DirectFt(ViewTask):
             )
         return SourceCheckpoint(path, weights_digest(path))
 
-    def _check_base_of_dataset(self, location: Path) -> None:
+    def _check_base_of_dataset(self) -> None:
         """InputError if the dataset was not built with the weights of SHARP that are trained here.
 
         The dataset's manifest records its base: the network that turned photos into Gaussians.
         """
-        base = self.files.manifest.config.get("base", {})
+        first_part = self.dataset.parts[0]  # all have the same base
+        base = first_part.manifest.config.get("base", {})
         name = base.get("name")
         weights = base.get("weights")  # their SHA-256
         # With another network the holes of the views would lie elsewhere.
         if name != "sharp" or weights != self.sharp_checkpoint.sha256:
             raise InputError(
-                f"{location}: built with the base {name}, weights {weights}: build a dataset with "
-                f"`base` sharp and the weights {self.sharp_checkpoint.path}"
+                f"{first_part.location}: built with the base {name}, weights {weights}: build a "
+                f"dataset with `base` sharp and the weights {self.sharp_checkpoint.path}"
             )
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Load SHARP; returns the file and digest of its weights for run.json."""
+        """Load SHARP; returns the datasets and the file and digest of its weights, for run.json."""
         self.base = TunableSharp.load(self.sharp_checkpoint.path, self.precision, self.device)
         self.network = self.base.network.gaussian_decoder().enable_training()
         reporter.log(f"{self.items} training photos, {self.validation_items} validation photos")
         return {
+            "datasets": self.dataset.facts,
             "checkpoint": {
                 "file": self.sharp_checkpoint.path.name,
                 "sha256": self.sharp_checkpoint.sha256,
-            }
+            },
         }
 
     def load_batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
@@ -292,10 +290,10 @@ class DirectFt(ViewTask):
         """
         (item,) = items  # `micro_batch` is 1
         if step is None:
-            photo = self.files[self.validation_photos[item]]
+            photo = self.dataset[self.validation_photos[item]]
             view_numbers = list(range(photo.views))
         else:
-            photo = self.files[self.training_photos[item]]
+            photo = self.dataset[self.training_photos[item]]
             # The choice depends on these numbers alone: a resumed run makes the same choice.
             view_numbers = draw_view_numbers([self.recipe.run.seed, step, item], photo.views)
         return [photo.view(number) for number in view_numbers]

@@ -55,6 +55,16 @@ def scientific_as_number(value: object) -> object:
     return value
 
 
+def as_locations(value: object) -> object:
+    """A list of places for a single place, and an empty one for None; other values unchanged."""
+    if value is None:
+        return ()
+    places = [value] if isinstance(value, str | os.PathLike) else value
+    if not isinstance(places, list | tuple):
+        return value
+    return tuple(os.fspath(place) if isinstance(place, os.PathLike) else place for place in places)
+
+
 Section = Annotated[T, BeforeValidator(empty_section_as_defaults)]
 Int = Annotated[int, BeforeValidator(scientific_as_number)]
 NonNegative = Annotated[float, Field(ge=0, le=1e6)]
@@ -63,6 +73,8 @@ Beta = Annotated[float, Field(ge=0, lt=1)]
 Disparity = Annotated[float, Field(ge=0, le=MAX_DISPARITY)]
 Interval = Annotated[Int, Field(ge=1), MAY_CHANGE_ON_RESUME]  # steps
 OptionalPath = Annotated[Path | None, MAY_CHANGE_ON_RESUME]
+# Folders, patterns of folders, or addresses, whose "//" a Path would lose.
+Locations = Annotated[tuple[str, ...], BeforeValidator(as_locations), MAY_CHANGE_ON_RESUME]
 Seed = Annotated[Int, Field(ge=0, le=2**31 - 2)]  # training and validation use 2 · seed and more
 
 
@@ -98,7 +110,7 @@ class DataRecipe(RecipePart):
     photos: OptionalPath = None  # a folder, with its subfolders
     rgbd: Annotated[tuple[RgbdFolder, ...], MAY_CHANGE_ON_RESUME] = ()
     stereo: OptionalPath = None  # a folder of scenes, each with a scene.json
-    pseudo: OptionalPath = None  # a dataset that `spackle dataset build` made
+    pseudo: Locations = ()  # datasets that `spackle dataset build` made, joined to one
     shares: Section[Shares] = Shares()
     # Least and greatest disparity of the virtual camera.
     disparity: Annotated[

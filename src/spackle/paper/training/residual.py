@@ -325,6 +325,7 @@ class ResidualTask(ViewTask):
             self.network = first_network(recipe.network, recipe.init).requires_grad_()
         self.items_per_step = recipe.optim.batch
 
+        self.datasets: Sequence[Mapping[str, Any]]  # that the samples come from, for run.json
         self.training: WholeViews | StoredCrops
         self.validation: WholeViews | StoredCrops
         if recipe.data.crops is None:
@@ -334,6 +335,7 @@ class ResidualTask(ViewTask):
             self.training = whole_views.training
             self.validation = whole_views.validation
             self.digest = whole_views.digest
+            self.datasets = whole_views.datasets
         else:
             # A crop keeps only the Gaussians of the base near its holes.
             if recipe.cells != "masked":
@@ -341,6 +343,7 @@ class ResidualTask(ViewTask):
             self.training_sources = find_sources(recipe.data, self.renderer, validation=False)
             self.validation_sources = find_sources(recipe.data, self.renderer, validation=True)
             self.digest = digest_of_samples(recipe.data, self.training_sources)
+            self.datasets = [facts for source in self.training_sources for facts in source.datasets]
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Make the crops that do not exist yet; returns facts about all samples for run.json.
@@ -361,6 +364,7 @@ class ResidualTask(ViewTask):
                 "validation": self.validation_items,
                 "digest": self.digest,
             },
+            "datasets": self.datasets,
             # Only the process of rank 0 writes run.json, so the others need not measure.
             "hole_psnr": self.reachable_psnr() if rank() == 0 else {},
         }

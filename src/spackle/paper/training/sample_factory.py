@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,8 @@ class Source(NamedTuple):
     # What identifies its views: the source's name, and its files' names relative to their folder.
     names: Sequence[str]
     views: int | None = None  # number of views, numbered from 0; None: any number, drawn at random
+    # Place, digest and configuration of each dataset that the views come from, for run.json.
+    datasets: Sequence[Mapping[str, Any]] = ()
 
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:

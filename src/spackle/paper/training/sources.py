@@ -7,7 +7,6 @@ the right photo as the target, a dataset of `spackle dataset build` the pictures
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,7 +22,8 @@ from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import SHARP_TRAJECTORIES, trajectory_cameras
 from spackle.depth.depth_map import DepthMap
-from spackle.paper.dataset.shards import DatasetFiles
+from spackle.paper.dataset.joined import JoinedDataset
+from spackle.paper.dataset.shards import SampleEntry
 from spackle.paper.training.composites import draw_composite
 from spackle.paper.training.measured_photos import (
     draw_left_photo,
@@ -75,8 +75,8 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     sources = [source for source in sources if source.share > 0]
 
     # A dataset is large, so it is only opened if it is used.
-    if data.pseudo is not None and data.shares.pseudo > 0:
-        sources.append(dataset_source(data, data.pseudo, validation=validation))
+    if data.pseudo and data.shares.pseudo > 0:
+        sources.append(dataset_source(data, validation=validation))
     if not sources:
         raise InputError(
             "the recipe has no data: set data.photos=FOLDER, data.rgbd, data.stereo or "
@@ -153,16 +153,18 @@ def stereo_sources(data: DataRecipe, folder: Path, renderer: Renderer) -> list[S
     return [reverse_views, right_views]
 
 
-def dataset_source(data: DataRecipe, location: Path, *, validation: bool) -> Source:
-    """A source of the views with holes of a dataset: of its training or of its validation photos.
+def dataset_source(data: DataRecipe, *, validation: bool) -> Source:
+    """A source of the views with holes of the recipe's datasets: of their training or of their
+    validation photos.
 
-    The dataset was built with an inpainter, whose pictures are the targets. InputError if the
-    dataset cannot be used.
+    The datasets were built with an inpainter, whose pictures are the targets. InputError if they
+    cannot be used.
     """
-    dataset = open_pseudo_dataset(location)
+    dataset = open_pseudo_dataset(data.pseudo)
     training_photos, validation_photos = split_photos(dataset, data)
     photos = validation_photos if validation else training_photos
-    views = [(photo, view) for photo in photos for view in views_with_holes(dataset, photo)]
+    samples = dataset.samples
+    views = [(photo, view) for photo in photos for view in views_with_holes(samples[photo])]
 
     # The views of a photo follow each other, so the last photo is kept in memory.
     read_photo = lru_cache(maxsize=1)(dataset.__getitem__)
@@ -183,8 +185,14 @@ def dataset_source(data: DataRecipe, location: Path, *, validation: bool) -> Sou
 
     # These texts identify the training samples. The numbers of the validation photos are among
     # them, because a dataset that is divided differently gives other samples.
-    names = ["pseudo", dataset.manifest.digest, *map(str, validation_photos)]
-    return Source(share=data.shares.pseudo, view=stored_view, names=names, views=len(views))
+    names = ["pseudo", dataset.digest, *map(str, validation_photos)]
+    return Source(
+        share=data.shares.pseudo,
+        view=stored_view,
+        names=names,
+        views=len(views),
+        datasets=dataset.facts,
+    )
 
 
 def relative_names(files: Sequence[Path], folder: Path) -> list[str]:
@@ -354,39 +362,39 @@ def random_right_view(
 # Datasets -----------------------------------------------------------------------------------------
 
 
-def open_pseudo_dataset(location: str | os.PathLike[str]) -> DatasetFiles:
-    """Open a pseudo-supervised dataset: views whose targets an inpainter has painted.
+def open_pseudo_dataset(locations: Sequence[str]) -> JoinedDataset:
+    """Open pseudo-supervised datasets as one: views whose targets an inpainter has painted.
 
-    InputError if it is no finished dataset, was built without an inpainter, or no view has a hole.
+    InputError if one is no finished dataset, they do not belong together, they were built without
+    an inpainter, or no view has a hole.
     """
-    files = DatasetFiles(location)
-    inpainter = files.manifest.config.get("inpainter", {}).get("name")
-    # Holes that were left empty, or completed without an inpainter, hold nothing new to learn.
-    if inpainter in INPAINTERS_WITHOUT_TARGETS:
+    dataset = JoinedDataset(locations)
+    for part in dataset.parts:
+        inpainter = part.manifest.config.get("inpainter", {}).get("name")
+        # Holes that were left empty, or completed without an inpainter, hold nothing new to learn.
+        if inpainter in INPAINTERS_WITHOUT_TARGETS:
+            raise InputError(
+                f"{part.location}: built with `inpainter` {inpainter}, whose targets teach "
+                "nothing: build another dataset with `inpainter` propainter, exemplar or lama"
+            )
+    if not any(any(sample.holes) for sample in dataset.samples):
         raise InputError(
-            f"{location}: built with `inpainter` {inpainter}, whose targets teach nothing: build "
-            "another dataset with `inpainter` propainter, exemplar or lama"
+            f"{dataset.where}: no view has a hole: build the dataset with a wider `disparity`"
         )
-    if not any(views_with_holes(files, photo) for photo in range(len(files))):
-        raise InputError(
-            f"{location}: no view has a hole: build the dataset with a wider `disparity`"
-        )
-    return files
+    return dataset
 
 
-def split_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
+def split_photos(dataset: JoinedDataset, data: DataRecipe) -> tuple[list[int], list[int]]:
     """Divide a dataset's photos; returns the indices of those for training, then for validation.
 
     The recipe `data` says how many views each of the two needs: `views` and `validation_views`.
     Validation gets at most half of the photos. InputError if the dataset has a single photo.
     """
-    photo_count = len(files)
-    _, first_sample = files.samples[0]
-    views_per_photo = len(first_sample.holes)  # the same number for all photos
+    photo_count = len(dataset)
+    views_per_photo = len(dataset.samples[0].holes)  # the same number for all photos
     if photo_count < 2:
-        # `data.pseudo` is where the dataset lies.
         raise InputError(
-            f"{data.pseudo}: has one photo, but training and validation need two: build a larger "
+            f"{dataset.where}: has one photo, but training and validation need two: build a larger "
             "one"
         )
 
@@ -401,7 +409,6 @@ def split_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list
     return training_photos, validation_photos
 
 
-def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
-    """Numbers of the views of a dataset's photo, given by its index, that have a hole."""
-    _, sample = files.samples[photo]
+def views_with_holes(sample: SampleEntry) -> list[int]:
+    """Numbers of the views of a dataset's photo, of which `sample` is the entry, with a hole."""
     return [view for view, hole_ratio in enumerate(sample.holes) if hole_ratio > 0]

@@ -10,13 +10,13 @@ import contextlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
 from spackle.bases import BasePrediction
+from spackle.paper.dataset.joined import JoinedDataset
 from spackle.paper.dataset.sample import PhotoGroup
-from spackle.paper.dataset.shards import DatasetFiles
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.sample_factory import short_digest
 from spackle.paper.training.samples import Sample
@@ -37,18 +37,23 @@ class SplitViews(NamedTuple):
     training: WholeViews
     validation: WholeViews
     digest: str  # identifies the views
+    datasets: list[dict[str, Any]]  # place, digest and configuration of each, for run.json
 
 
 class WholeViews:
     """All views of some photos of a dataset, numbered from 0: the views of each photo in a row."""
 
     def __init__(
-        self, files: DatasetFiles, photos: Sequence[int], network: ResidualNet, renderer: Renderer
+        self,
+        dataset: JoinedDataset,
+        photos: Sequence[int],
+        network: ResidualNet,
+        renderer: Renderer,
     ) -> None:
         """Number the views; nothing is read yet.
 
         Args:
-            files: the dataset.
+            dataset: the dataset.
             photos: the photos' indices in the dataset.
             network: the network that is trained; views compute the inputs that it names.
             renderer: renders the base, the photo's Gaussians, from the views.
@@ -57,10 +62,11 @@ class WholeViews:
         self.renderer = renderer
         # Of each view: the photo's index in the dataset, and the view's number among the photo's.
         self.views: list[tuple[int, int]] = []
+        samples = dataset.samples
         for photo in photos:
-            _, entry = files.samples[photo]
-            self.views += [(photo, view) for view in range(len(entry.holes))]
-        self._read_photo = lru_cache(maxsize=KEPT_PHOTOS)(files.__getitem__)
+            view_count = len(samples[photo].holes)
+            self.views += [(photo, view) for view in range(view_count)]
+        self._read_photo = lru_cache(maxsize=KEPT_PHOTOS)(dataset.__getitem__)
 
         # Samples are read by threads. A new thread uses CUDA's device 0, so each is told which
         # device this process uses; see `_on_renderer_device`.
@@ -83,14 +89,16 @@ class WholeViews:
     def _make_sample(self, photo: PhotoGroup, view_index: int) -> Sample:
         """One view of a photo, rendered from the photo's Gaussians as evaluation renders it.
 
-        The dataset's own pictures of the view are not used, because they have 8 bits.
+        The dataset's own rendering of the view, if it has one, is not used, because its pictures
+        have 8 bits.
         """
-        view = photo.view(view_index)
+        camera = photo.camera(view_index)
         base = photo.base.to(self.renderer.device)
-        prediction = BasePrediction(base, view.photo_camera, notes={}, photo=view.photo)
+        prediction = BasePrediction(base, photo.photo_camera, notes={}, photo=photo.photo)
         context = FillContext.of(prediction, self.renderer, self.network)
-        rendering = self.renderer.render(context.base, view.camera)
-        return Sample(context.base, context.view(rendering, view.camera), view.target)
+        rendering = self.renderer.render(context.base, camera)
+        target = photo.target(view_index, rendering.rgb)
+        return Sample(context.base, context.view(rendering, camera), target)
 
     def _on_renderer_device(self) -> AbstractContextManager[object]:
         """A block in which CUDA's current device is the renderer's."""
@@ -114,15 +122,16 @@ def find_whole_views(data: DataRecipe, network: ResidualNet, renderer: Renderer)
         InputError: the recipe names other data, or the dataset cannot be used.
     """
     has_other_data = data.photos is not None or data.rgbd or data.stereo is not None
-    if data.pseudo is None or has_other_data:
+    if not data.pseudo or has_other_data:
         raise InputError(
             "data.crops=null: whole views come from data.pseudo alone, a dataset of `spackle "
             "dataset build`: leave out data.photos, data.rgbd and data.stereo, or set data.crops=1"
         )
-    files = open_pseudo_dataset(data.pseudo)
-    training_photos, validation_photos = split_photos(files, data)
+    dataset = open_pseudo_dataset(data.pseudo)
+    training_photos, validation_photos = split_photos(dataset, data)
     return SplitViews(
-        training=WholeViews(files, training_photos, network, renderer),
-        validation=WholeViews(files, validation_photos, network, renderer),
-        digest=short_digest((files.manifest.digest, training_photos, validation_photos)),
+        training=WholeViews(dataset, training_photos, network, renderer),
+        validation=WholeViews(dataset, validation_photos, network, renderer),
+        digest=short_digest((dataset.digest, training_photos, validation_photos)),
+        datasets=dataset.facts,
     )
