@@ -41,7 +41,7 @@ from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.runtime.digests import json_digest
 from spackle.runtime.errors import InputError, printable_line
-from spackle.web.work import check_photo
+from spackle.web.decoding import check_photo
 from spackle.weights.checkpoints import read_tensors
 
 Files = dict[str, bytes]  # name in the case's folder → content

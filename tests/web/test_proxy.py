@@ -50,6 +50,11 @@ def small_proxy(server: Served, forwarded_host: str | None) -> Iterator[Served]:
                     connection.settimeout(5)
                     head, _, body = whole_request(connection).partition(b"\r\n\r\n")
                     lines = head.split(b"\r\n")
+                    # The body may come later than the head.
+                    for line in lines:
+                        if line.lower().startswith(b"content-length:"):
+                            while len(body) < int(line.partition(b":")[2]):
+                                body += connection.recv(1 << 20)
                     lines = [line for line in lines if not line.lower().startswith(b"host:")]
                     lines.insert(1, f"Host: 127.0.0.1:{server.port}".encode())
                     lines.insert(2, b"Connection: close")

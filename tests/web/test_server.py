@@ -51,9 +51,9 @@ from PIL import Image
 from spackle.core.photo import load_photo
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import WORKER_DIED
+from spackle.web.decoding import check_photo
 from spackle.web.jobs import RetentionLimits
 from spackle.web.uploads import safe_display_name
-from spackle.web.work import check_photo
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,8 @@ def test_a_photo_becomes_a_scene(server: Served) -> None:
 
 def test_the_interface_is_described(server: Served) -> None:
     paths = server.ask("/api/v1/openapi.json").json["paths"]
-    below = ("", "/{id}", "/{id}/events", "/{id}/files/{file}", "/{id}/fill", "/{id}/remove")
+    parts = ("events", "files/{file}", "fill", "link", "remove")
+    below = ("", "/{id}", *(f"/{{id}}/{part}" for part in parts))
     assert set(paths) == {*(f"{SCENES}{path}" for path in below), "/healthz", "/readyz", "/metrics"}
     docs = server.ask("/docs").body.decode()
     assert all(word in docs for word in ("DELETE", "keep_frame", "scene.spz", "mask", "cameras"))

@@ -8,10 +8,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import json
 import os
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import uvicorn
 from fastapi import Depends, FastAPI, Header, Query, Request
@@ -26,8 +27,10 @@ from fastapi.responses import (
 from fastapi.sse import EventSourceResponse
 from jinja2 import Template
 from pydantic import BaseModel, Field
+from python_multipart.multipart import parse_options_header
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -51,12 +54,12 @@ from spackle.web.description import (
     OCTETS,
     PAGE_OF_STATES,
     READY,
-    REASONS,
     STATE,
     DescribedApp,
     refusals,
     resolve,
 )
+from spackle.web.failures import as_no_space, refusal_of
 from spackle.web.guard import (
     MAX_UPLOAD_BYTES,
     POLICY_HEADER,
@@ -66,7 +69,17 @@ from spackle.web.guard import (
     Guard,
     outer_root,
 )
-from spackle.web.jobs import Job, Jobs, RequestKey, RetentionLimits, SceneState, Submission, age_key
+from spackle.web.jobs import (
+    DECODER_COUNT,
+    Job,
+    Jobs,
+    RequestKey,
+    RetentionLimits,
+    SceneState,
+    Submission,
+    age_key,
+    error_line,
+)
 from spackle.web.metrics import Metrics
 from spackle.web.public_address import LOCAL_ONLY
 from spackle.web.scene_links import MAX_CAPTION_LENGTH, SHARED_PATH, SceneLink, SceneLinks
@@ -97,7 +110,7 @@ PagePart = Literal[
 LISTED_FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video), *get_args(SharedVideo)])
 POLL_S = 0.1  # seconds between two checks whether a state has changed
 MAX_UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
-MAX_CONNECTIONS = 512  # open at a time; further ones are refused
+MAX_CONNECTIONS = 512  # open at a time; for a further one, an idle one is closed
 MAX_HEAD_S = 10.0  # seconds that a client may take to send the head of a request
 DEFAULT_PAGE_SIZE = 20  # states
 MAX_PAGE_SIZE = 100
@@ -192,7 +205,6 @@ def create_app(
         exception_handlers={
             HTTPException: error_answer,
             RequestValidationError: error_answer,
-            Exception: fault_answer,
         },
     )
     app.needs_token = access is not None and access.token is not None
@@ -295,7 +307,7 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
         one_scene + "/files/{file}",
         handlers.get_file,
         response_class=FileResponse,
-        responses={**FILE, **refusals(404, 409)},
+        responses={**FILE, **refusals(404, 409, 429, 507)},
     )
 
 
@@ -428,8 +440,8 @@ class SceneHandlers:
         self.rates = rates
         # Clients and Idempotency-Keys of requests that still arrive.
         self.keys_in_progress: set[tuple[str, str]] = set()
-        # One photo is decoded at a time: decoding a large one takes a gigabyte of memory.
-        self.decoding = asyncio.Lock()
+        # A photo that waits for its decoder takes no thread from other requests.
+        self.decoding = asyncio.Semaphore(DECODER_COUNT)
 
     async def post_photo(
         self, request: Request, response: Response, idempotency_key: IdempotencyKey = None
@@ -519,7 +531,12 @@ class SceneHandlers:
         """The new job of a form; see `_accept`."""
         client = client_of(request.scope)
         # The place is reserved first, so that a refused photo is not even received.
-        with self.rates.count_photo(client), self.jobs.reserve_place() as upload_folder:
+        check_form_type(request)
+        with (
+            self.rates.count_photo(client),
+            as_no_space(),
+            self.jobs.reserve_place() as upload_folder,
+        ):
             try:
                 # Two files, such as the photo and its depth map. Two text fields: the options, and
                 # the address to call at the end.
@@ -546,7 +563,8 @@ class SceneHandlers:
 
     def state_of(self, job: Job) -> SceneState:
         """The state of a job as clients see it, with its place and the files that exist now."""
-        return state_with_files(job, self.jobs.place_of(job))
+        state = state_with_files(job, self.jobs.place_of(job))
+        return state.model_copy(update={"making": self.jobs.files_in_work(job.id)})
 
     async def list_scenes(
         self, request: Request, limit: PageSize = DEFAULT_PAGE_SIZE, after: PageMark = None
@@ -598,11 +616,11 @@ class SceneHandlers:
             await asyncio.sleep(POLL_S)
 
     async def get_file(
-        self, id: str, file: FileName | PagePart, caption: PageCaption = ""
+        self, id: str, file: FileName | PagePart, request: Request, caption: PageCaption = ""
     ) -> Response:
         """A file of a finished scene; a file that does not exist yet is made on demand."""
         job = self.find_job(id)
-        path = await self.make_file(job, file)
+        path = await self.make_file(request, job, file)
         name = PurePosixPath(job.name).stem + path.suffix
         if file == PAGE_FILE and caption:
             page = await run_in_threadpool(path.read_bytes)
@@ -612,24 +630,44 @@ class SceneHandlers:
             )
         return FileResponse(path, filename=name, media_type=MEDIA_TYPES.get(path.suffix, OCTETS))
 
-    async def make_file(self, job: Job, file: str) -> Path:
+    async def make_file(self, request: Request, job: Job, file: str) -> Path:
         """Where a file of a finished scene lies; it is made first if it does not exist yet.
 
         HTTPException 409 if the scene is not done, 404 if the file cannot be made.
         """
-        path = path_of_file(job, file)
+        path = own_file(job, file)
         if not path.is_file():
             if job.state != "done":
                 raise HTTPException(409, job.error or "this scene is not done yet")
             # What the page draws was written with the scene, so it cannot be made now.
             if file in get_args(PagePart):
                 raise HTTPException(404, "this scene has no such file")
-            # If this client disconnects, the file is still made, because others may want it, too.
-            future_error = asyncio.wrap_future(self.jobs.make_file(job, file))
-            error = await asyncio.shield(future_error)
-            if error is not None:
-                raise HTTPException(404, error)
+            await self._wait_for_file(request, job, file)
         return path
+
+    async def _wait_for_file(self, request: Request, job: Job, file: str) -> None:
+        """Wait until a file of a finished scene is made, or the client has gone.
+
+        Raises:
+            HTTPException: the file cannot be made: 404 for what the scene cannot give, 429 if too
+                many files wait, 507 if the disk is full.
+            ClientDisconnect: the client has gone.
+        """
+        is_video = file in (*get_args(Video), *get_args(SharedVideo))
+        with self.jobs.wait_for_file(job, file, is_video=is_video) as file_order:
+            made = asyncio.wrap_future(file_order.order.outcome)
+            left = asyncio.ensure_future(wait_for_disconnect(request))
+            ends: set[asyncio.Future[Any]] = {made, left}
+            try:
+                await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+                if not made.done():
+                    raise ClientDisconnect
+            finally:
+                left.cancel()
+            failure = made.result()
+        if failure is not None:
+            named = failure._replace(line=error_line(file, failure))
+            raise refusal_of(named, 404 if failure.kind == "input" else 500)
 
     async def get_page_state(self) -> dict[str, object]:
         """What the page may send: kinds of files, size limit, and networks to choose from.
@@ -723,7 +761,7 @@ class SharedScenes:
     ) -> HTMLResponse:
         """The page of one scene, as `scene.html` is, with a caption."""
         job = self._find(id, key, caption)
-        path = await self.handlers.make_file(job, PAGE_FILE)
+        path = await self.handlers.make_file(request, job, PAGE_FILE)
         page = await run_in_threadpool(path.read_bytes)
 
         # Programs that show previews of links fetch the picture by its full address.
@@ -737,7 +775,7 @@ class SharedScenes:
     async def get_preview(self, id: str, key: str) -> FileResponse:
         """The small photo of a scene, for previews of its link."""
         job = self._find(id, key, "")
-        return FileResponse(path_of_file(job, PREVIEW), media_type=MEDIA_TYPES[".jpg"])
+        return FileResponse(own_file(job, PREVIEW), media_type=MEDIA_TYPES[".jpg"])
 
     def _find(self, id: str, key: str, caption: str) -> Job:
         """The finished job that a link leads to; HTTPException 404 for a link that is none."""
@@ -746,10 +784,27 @@ class SharedScenes:
         return self.handlers.find_finished(id)
 
 
+async def wait_for_disconnect(request: Request) -> None:
+    """Return when the client of a request has gone; the body of the request is passed over."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
 def path_of_file(job: Job, file: str) -> Path:
     """Where a file of a job lies; the preview of the photo exists before the results do."""
     folder = job.folder if file == PREVIEW else job.results
     return folder / file
+
+
+def own_file(job: Job, file: str) -> Path:
+    """Where a file of a job lies, if it is no link; HTTPException 404 for one.
+
+    Whoever can put a link there might lead clients to any file of this machine.
+    """
+    path = path_of_file(job, file)
+    if path.is_symlink() or path.parent.is_symlink():
+        raise HTTPException(404, "this scene has no such file")
+    return path
 
 
 def state_with_files(job: Job, place: int | None = None) -> SceneState:
@@ -762,6 +817,17 @@ def state_with_files(job: Job, place: int | None = None) -> SceneState:
         existing.add(PREVIEW)
     files = [file for file in LISTED_FILES if file in existing]
     return job.model_copy(update={"files": files, "place": place})
+
+
+def check_form_type(request: Request) -> None:
+    """HTTPException 400 for a form that is not multipart or whose texts are not UTF-8.
+
+    Some of Python's codecs take minutes for a megabyte, and forms of the other kind are unbounded.
+    """
+    media_type, details = parse_options_header(request.headers.get("content-type"))
+    charset = details.get(b"charset", b"utf-8").lower()
+    if media_type != b"multipart/form-data" or charset not in (b"utf-8", b"utf8"):
+        raise HTTPException(400, "send a form as multipart/form-data, with texts in UTF-8")
 
 
 async def error_answer(request: Request, error: Any) -> JSONResponse:
@@ -782,11 +848,6 @@ async def error_answer(request: Request, error: Any) -> JSONResponse:
     return JSONResponse({"error": line}, 422)
 
 
-async def fault_answer(request: Request, error: Exception) -> JSONResponse:
-    """The answer to a request at which the server has a fault, which `Guard` has logged."""
-    return JSONResponse({"error": REASONS[500][1]}, 500, SECURITY_HEADERS)
-
-
 def make_server(app: FastAPI) -> uvicorn.Server:
     """A server whose `run(sockets=[listener])` serves an app until Ctrl-C or SIGTERM.
 
@@ -800,7 +861,6 @@ def make_server(app: FastAPI) -> uvicorn.Server:
         log_level="critical",  # the app logs requests and errors itself
         server_header=False,  # strangers learn no versions
         proxy_headers=False,  # anybody could claim another address
-        limit_concurrency=MAX_CONNECTIONS,
         timeout_graceful_shutdown=1,  # seconds for clients that still watch a photo
     )
     return uvicorn.Server(config)
@@ -810,13 +870,52 @@ class PatientProtocol(H11Protocol):
     """uvicorn's connection to one client, which ends if the client stays silent.
 
     A client may take `MAX_HEAD_S` seconds for it. Otherwise silent clients could take up all
-    connections.
+    connections. If there are too many, the one that has been idle for longest makes room: it never
+    keeps anybody else out.
     """
 
+    # Connections without a request that is being answered; the one that is idle for longest first.
+    idle: ClassVar[dict[PatientProtocol, None]] = {}
+
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Note a new connection, and begin to watch it."""
+        """Note a new connection, make room for it, and begin to watch it."""
         super().connection_made(transport)
+        if len(self.connections) > MAX_CONNECTIONS:
+            # Another server of this process has other connections.
+            idle = [each for each in self.idle if each in self.connections]
+            (idle[0] if idle else self).transport.abort()
+        self.idle[self] = None
         self._end_if_silent(BUSY)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget a connection."""
+        self.idle.pop(self, None)
+        super().connection_lost(exc)
+
+    def handle_events(self) -> None:
+        """Read what has come; a connection with a request is not idle."""
+        super().handle_events()
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.idle.pop(self, None)
+
+    def on_response_complete(self) -> None:
+        """Note that the connection is idle again."""
+        self.idle[self] = None
+        super().on_response_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is no HTTP, with the headers of every answer; the connection ends."""
+        body = json.dumps({"error": "this is no HTTP request"}).encode()
+        headers = {
+            "Content-Type": "application/json",
+            "Content-Length": str(len(body)),
+            "Connection": "close",
+            **SECURITY_HEADERS,
+        }
+        lines = [f"{name}: {value}" for name, value in headers.items()]
+        head = "\r\n".join(["HTTP/1.1 400 Bad Request", *lines, "", ""])
+        self.transport.write(head.encode() + body)
+        self.transport.close()
 
     def _end_if_silent(self, idle_after: object) -> None:
         """Close the connection if it was idle since the last call; otherwise check again later.

@@ -62,10 +62,14 @@ REASONS = {
         "too many photos are waiting: try again in 10 seconds",
     ),
     503: ("The server cannot work now.", "the disk of the folder of scenes is full: 3 MB are left"),
+    507: (
+        "The disk of the server is full. Nothing is wrong with the request: send it again later.",
+        "the server cannot store this now (No space left on device): try again later",
+    ),
     500: ("The server has a fault.", "internal error: the reason is in the server's log"),
 }
 ANY_REQUEST = (403, 500)  # the statuses with which any request can be refused
-ANY_FORM = (400, 408, 409, 413, 422, 429)  # and those of any form that is sent
+ANY_FORM = (400, 408, 409, 413, 422, 429, 507)  # and those of any form that is sent
 
 STATE_EXAMPLE: dict[str, Any] = {
     "id": "6f1c2a9b0d3e4f58",
@@ -76,6 +80,7 @@ STATE_EXAMPLE: dict[str, Any] = {
     "line": "focal length 1234 px (from the photo)",
     "error": None,
     "files": ["photo.jpg"],
+    "making": [],
     "place": None,
     "created": 1790000000.0,
     "ended": None,

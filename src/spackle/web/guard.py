@@ -12,6 +12,7 @@ import ipaddress
 import logging
 import re
 import socket
+import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -21,8 +22,11 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from spackle.runtime.errors import printable_line
+from spackle.runtime.errors import printable_line, reason_in_a_line
+from spackle.runtime.task_process import machine_fault
 from spackle.web.clients import CLIENT_KEY, OPERATOR, Client
+from spackle.web.description import REASONS
+from spackle.web.failures import RETRY_AFTER_S, no_space
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
 from spackle.web.scene_links import SHARED_PATH
 
@@ -46,6 +50,10 @@ PREFLIGHT = "spackle.preflight"  # marks a browser's question about what it may 
 OUTER_ROOT = "spackle.outer_root"  # the root path of an app, without the token, in the scope
 STRANGER = "spackle.stranger"  # marks a request without the token, in its scope
 MAX_SEND_S = 20.0  # seconds that a client may take to read a part of an answer
+MAX_SILENCE_S = 10.0  # seconds that a client may send nothing of a body
+# Bytes a second, slower than the slowest phone: a body that trickles holds a place in the queue.
+MIN_BODY_SPEED = 2000.0
+MAX_REQUESTS = 448  # answered at a time
 MAX_UPLOAD_BYTES = 200_000_000  # of an upload: photo and depth map
 # The page loads scripts and styles from this server only and sends nothing elsewhere; no other page
 # can frame it.
@@ -251,6 +259,7 @@ class Guard:
         self.access = access
         self.max_bytes = max_bytes
         self.count_answer = count_answer
+        self.request_count = 0  # of the requests that are being answered
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, if it may be answered.
@@ -266,8 +275,18 @@ class Guard:
 
         headers = Headers(scope=scope)
         receive_limited = self._limited(receive)
-        send_guarded = self._guarded(scope, headers, send)
+        send_guarded = GuardedSend(send, self._answer_headers(headers), self._note_answer(scope))
+
+        async def refuse(error: HTTPException) -> None:
+            """Answer with an error, unless another answer has begun: then the connection ends."""
+            if send_guarded.has_begun:
+                raise error
+            answer = JSONResponse({"error": error.detail}, error.status_code, error.headers)
+            await answer(scope, receive, send_guarded)
+
+        self.request_count += 1
         try:
+            self._check_message(headers)
             admitted = scope
             if self.access is not None:
                 admitted = self.access.authorize(scope, headers)
@@ -280,13 +299,30 @@ class Guard:
             self._check_size(int(headers.get("content-length", 0)))
             await self.app(admitted, receive_limited, send_guarded)
         except HTTPException as error:
-            answer = JSONResponse({"error": error.detail}, error.status_code)
-            await answer(scope, receive, send_guarded)
+            await refuse(error)
         except (asyncio.TimeoutError, ClientDisconnect):
             LOG.debug("a client disconnected, or does not read its answer")
-        except Exception:
-            LOG.exception("this went wrong:")
-            raise
+        except Exception as error:
+            fault = machine_fault(error)
+            if fault is None:
+                LOG.exception("this went wrong:")
+                await refuse(HTTPException(500, REASONS[500][1]))
+            else:
+                await refuse(no_space(reason_in_a_line(fault)))
+        finally:
+            self.request_count -= 1
+
+    def _check_message(self, headers: Headers) -> None:
+        """HTTPException 400 for a body of two lengths, 503 if too many requests are answered.
+
+        With two lengths, a proxy may take the end of a body for another request.
+        """
+        if "content-length" in headers and "transfer-encoding" in headers:
+            problem = "send either Content-Length or Transfer-Encoding"
+            raise HTTPException(400, problem, {"Connection": "close"})
+        if self.request_count > MAX_REQUESTS:
+            problem = "too many requests are answered: try again later"
+            raise HTTPException(503, problem, {"Retry-After": str(RETRY_AFTER_S)})
 
     def _check_size(self, byte_count: int) -> None:
         """HTTPException 413 if a body has more bytes than allowed."""
@@ -295,51 +331,55 @@ class Guard:
             raise HTTPException(413, f"more than {limit}: send a smaller photo")
 
     def _limited(self, receive: Receive) -> Receive:
-        """A `receive` that counts a body's bytes, and raises HTTPException 413 beyond the limit.
+        """A `receive` that counts a body's bytes and the time that they take.
 
-        The announced size is not enough, because a body may be longer, or announce none.
+        The announced size is not enough, because a body may be longer, or announce none. The
+        function raises HTTPException 413 for too long a body, and 408 for one that comes too
+        slowly: a client that sends nothing would hold a place in the queue.
         """
         received_bytes = 0
+        waited_s = 0.0
+        has_ended = False
 
         async def receive_limited() -> Message:
-            nonlocal received_bytes
-            message = await receive()
+            nonlocal received_bytes, waited_s, has_ended
+            if has_ended:  # what comes now is the end of the connection, at any time
+                return await receive()
+            allowed_s = MAX_SILENCE_S + received_bytes / MIN_BODY_SPEED
+            start = time.monotonic()
+            try:
+                message = await asyncio.wait_for(
+                    receive(), min(MAX_SILENCE_S, allowed_s - waited_s)
+                )
+            except asyncio.TimeoutError:
+                raise HTTPException(408, "the photo arrived too slowly") from None
+            waited_s += time.monotonic() - start
             received_bytes += len(message.get("body", b""))
+            has_ended = not message.get("more_body", False)
             self._check_size(received_bytes)
             return message
 
         return receive_limited
 
-    def _guarded(self, scope: Scope, headers: Headers, send: Send) -> Send:
-        """A `send` that adds the security headers to an answer, and logs the request.
-
-        It raises asyncio.TimeoutError if the client does not read the answer.
-
-        Args:
-            scope: the request.
-            headers: its headers.
-            send: takes the answer.
-        """
+    def _answer_headers(self, headers: Headers) -> dict[str, str]:
+        """The headers of every answer to a request with these headers."""
         # A browser shows the answer to a page of another site only if it names the site.
         page_origin = None
         if self.access is not None:
             page_origin = self.access.public.admitted_origin(headers)
-        site_headers: dict[str, str] = {}
-        if page_origin is not None:
-            site_headers = {"Access-Control-Allow-Origin": page_origin, **PAGE_HEADERS}
+        if page_origin is None:
+            return SECURITY_HEADERS
+        return {**SECURITY_HEADERS, "Access-Control-Allow-Origin": page_origin, **PAGE_HEADERS}
 
-        async def send_guarded(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                answer_headers = MutableHeaders(scope=message)
-                # A scene's own page brings a policy for its scripts; see `get_shared_page`.
-                policy = answer_headers.get(POLICY_HEADER, CONTENT_SECURITY_POLICY)
-                answer_headers.update({**SECURITY_HEADERS, POLICY_HEADER: policy, **site_headers})
-                self._log_request(scope, message["status"])
-                if self.count_answer is not None:
-                    self.count_answer(scope["method"], message["status"])
-            await asyncio.wait_for(send(message), MAX_SEND_S)
+    def _note_answer(self, scope: Scope) -> Callable[[int], None]:
+        """A function that logs and counts the answer to a request, by its status."""
 
-        return send_guarded
+        def note_answer(status: int) -> None:
+            self._log_request(scope, status)
+            if self.count_answer is not None:
+                self.count_answer(scope["method"], status)
+
+        return note_answer
 
     def _log_request(self, scope: Scope, status: int) -> None:
         """Log a request and the status of its answer; a token is replaced by "…"."""
@@ -349,3 +389,31 @@ class Guard:
         for token in () if self.access is None else self.access.tokens.values():
             path = path.replace(token, "…", 1)
         LOG.debug(printable_line(f"{scope['method']} {path} {status}"))
+
+
+class GuardedSend:
+    """The one door through which answers leave: it adds headers to them, and is not patient."""
+
+    def __init__(self, send: Send, headers: dict[str, str], note: Callable[[int], None]) -> None:
+        """Send an answer.
+
+        Args:
+            send: takes the parts of the answer.
+            headers: are added.
+            note: called with the status.
+        """
+        self.has_begun = False
+        self._send = send
+        self._headers = headers
+        self._note = note
+
+    async def __call__(self, message: Message) -> None:
+        """Send a part; asyncio.TimeoutError if the client does not read it."""
+        if message["type"] == "http.response.start":
+            self.has_begun = True
+            answer_headers = MutableHeaders(scope=message)
+            # A scene's own page brings a policy for its scripts; see `SharedScenes.get_page`.
+            policy = answer_headers.get(POLICY_HEADER, CONTENT_SECURITY_POLICY)
+            answer_headers.update({**self._headers, POLICY_HEADER: policy})
+            self._note(message["status"])
+        await asyncio.wait_for(self._send(message), MAX_SEND_S)

@@ -1,4 +1,8 @@
-"""Jobs: worker processes turn photos into scenes; the folder of jobs outlives the server."""
+"""Jobs: worker processes turn photos into scenes; the folder of jobs outlives the server.
+
+Three lanes of processes do the work: one decodes what is uploaded, one makes scenes, and two make
+files of finished scenes when somebody asks for them. All that is ordered for a scene ends with it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,6 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -20,19 +23,42 @@ from pydantic import BaseModel, Field
 from spackle.runtime.errors import InputError, as_input_error, reason_in_a_line
 from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
+from spackle.runtime.lanes import Lane, Order
 from spackle.runtime.progress import StageProgress
-from spackle.runtime.task_process import WORKER_DIED, TaskEvent, TaskFunction, TaskProcess
+from spackle.runtime.task_process import (
+    CANCELLED,
+    TaskEvent,
+    TaskFailure,
+    TaskFunction,
+    TaskLimits,
+    import_ahead,
+    machine_fault,
+)
 from spackle.web.callbacks import CallbackSender
 from spackle.web.clients import OPERATOR, may_use
+from spackle.web.decoding import DecodingTask, decode_upload
+from spackle.web.failures import full_queue, without_folders
 
 LOG = logging.getLogger("spackle.web")
 RECORD_FILE = "job.json"  # stores the state of a job, in the folder of the job
 UPLOAD_PREFIX = ".new-"  # begins the names of folders of incomplete uploads
-RETRY_AFTER_S = 10  # seconds after which a client may try again if the queue was full
+DELETED_PREFIX = ".old-"  # begins the names of folders that are being deleted
 MIN_FREE_BYTES = 200_000_000  # that a photo with its results may take
 # The task of a process that prepares for its first photo, and the stage of photos that wait for it.
 WARM_UP = "warm-up"
 TIDY_INTERVAL_S = 60.0  # seconds between two searches for results that are too old
+RETRY_S = 30.0  # seconds after which a photo is tried again if the disk was full
+# A worker that dies may have been killed by somebody else. The photo is blamed at the second time.
+MAX_ATTEMPTS = 2
+
+DECODER_COUNT = 2  # photos that are decoded at a time: a large one takes a gigabyte of memory
+# A photo of 100 megapixels takes a fifth of this time, and a third of this memory. The time by the
+# clock is for a decoder that waits for something.
+DECODING_LIMITS = TaskLimits(seconds=120, cpu_seconds=20, memory_bytes=4_000_000_000)
+FILE_LIMIT_S = 3600.0  # seconds that a file of a finished scene may take, if nothing else is said
+# Seconds after which a file is given up that nobody waits for any more. A proxy that has lost its
+# patience, or a client that has lost its connection, asks again at once.
+ABANDONED_AFTER_S = 5.0
 
 
 class RetentionLimits(NamedTuple):
@@ -82,6 +108,16 @@ class Submission(NamedTuple):
 OWN_SUBMISSION = Submission()  # of whoever runs the server
 
 
+class FileProgress(BaseModel):
+    """A file of a finished scene that is being made, because somebody has asked for it."""
+
+    file: str
+    place: int | None = Field(
+        default=None, description="Number of files that come before; null: it is being made."
+    )
+    share: float | None = Field(default=None, description="Fraction that is done, 0 to 1.")
+
+
 class SceneState(BaseModel):
     """The state of a photo, as clients see it."""
 
@@ -96,6 +132,9 @@ class SceneState(BaseModel):
     error: str | None = Field(default=None, description="Why it failed, in a line.")
     files: list[str] = Field(
         default=[], description="Existing files; a finished scene can make more."
+    )
+    making: list[FileProgress] = Field(
+        default=[], description="Files that are being made, because somebody has asked for them."
     )
     place: int | None = Field(
         default=None,
@@ -126,6 +165,7 @@ class Job(SceneState):
     # What the client called its request, and where it sent it, so that it can repeat the request.
     idempotency_key: str | None = None
     request_path: str | None = None
+    attempts: int = 0  # how often a worker has begun with it
     folder: Path = Field(default=Path(), exclude=True)
 
     @property
@@ -138,12 +178,27 @@ class Job(SceneState):
         write_json(self.model_dump(mode="json"), self.folder / RECORD_FILE)
 
 
+class FileOrder:
+    """A file of a finished scene that is being made, and how many clients wait for it."""
+
+    def __init__(self, order: Order) -> None:
+        """Nobody waits yet for the file of `order`."""
+        self.order = order
+        self.share: float | None = None  # that is done, 0..1
+        self.waiting_clients = 0
+
+    def note_event(self, event: TaskEvent) -> None:
+        """Note the progress that the process reports."""
+        if "line" not in event:
+            self.share = StageProgress(**event).share
+
+
 class Jobs:
     """The jobs in a folder, by id, and the processes that work on them.
 
-    A thread belongs to each process: it hands a photo over, and waits for the scene. One more
-    thread, with a process of its own, adds files to finished scenes. Jobs in `by_id` never change;
-    a change replaces a job by a new one, so that readers need no lock.
+    Jobs in `by_id` never change; a change replaces a job by a new one, so that readers need no
+    lock. What is in the record of a job on the disk is what a later server begins with; a job has
+    ended when its record says so, and not before.
     """
 
     def __init__(
@@ -176,62 +231,62 @@ class Jobs:
         self._folder_lock.enter_context(results_folder(folder, locked=True))
 
         self.by_id: dict[str, Job] = {}
-        self._queue: list[str] = []  # ids of the jobs that wait, the next one first
-        self._lock = threading.RLock()  # of `by_id`, of the queue, and of the processes
+        self._lock = threading.RLock()  # of `by_id`, and of the orders
         self._is_closed = threading.Event()
         self._is_warming_up = False
         self._work = work
-        self._processes: list[TaskProcess] = []
-        self._own_process = threading.local()  # the process of the calling thread
-        self._process_of_job: dict[str, TaskProcess] = {}  # by the id of a running job
         self.work_times = {"done": WorkTimes(), "failed": WorkTimes()}
-        self._timed_out: set[str] = set()  # ids of running jobs that took too long
-        # Each process that makes scenes has a number, which chooses its GPU. A single process, and
-        # the one that adds files, have none: they use torch's default GPU.
-        self._gpu_numbers = iter(range(workers) if workers > 1 else ())
-        self._scene_threads = ThreadPoolExecutor(workers, initializer=self._take_gpu_number)
-        self._file_thread = ThreadPoolExecutor(1)
+
+        import_ahead("spackle.web.preloaded")
+        # A process that makes scenes keeps the network that it has loaded. A single one, and those
+        # of the other lanes, use torch's default GPU.
+        gpu_numbers = range(workers) if workers > 1 else range(0)
+        self._scenes = Lane(work, workers, gpu_numbers=gpu_numbers)
+        self._decoders = Lane(decode_upload, DECODER_COUNT, is_kept=False)
+        # A video may take many minutes, and must not hold up the scene in another format.
+        self._videos = Lane(work, 1, is_kept=False)
+        self._small_files = Lane(work, 1, is_kept=False)
+        self._lanes = (self._scenes, self._decoders, self._videos, self._small_files)
+        self._scene_orders: dict[str, Order] = {}  # by the id of a job that waits or runs
+        self._file_orders: dict[tuple[str, str], FileOrder] = {}  # by id and name of the file
 
         # A process takes seconds to start: it does so while the first photo is uploaded.
-        self._scene_threads.submit(self._process)
+        self._scenes.prepare()
         self._resume_jobs()
         threading.Thread(target=self._tidy_until_closed, daemon=True).start()
 
     def _resume_jobs(self) -> None:
         """Queue the unfinished jobs of an earlier server again, and delete incomplete uploads."""
         for folder in self.folder.iterdir():
-            if folder.name.startswith(UPLOAD_PREFIX):
+            # A link may lead to anything, and is not ours.
+            if folder.is_symlink():
+                continue
+            if folder.name.startswith((UPLOAD_PREFIX, DELETED_PREFIX)):
                 shutil.rmtree(folder, ignore_errors=True)
             # A folder without a readable record is no job, and is left alone.
             with contextlib.suppress(OSError, ValueError):
                 job = Job.model_validate_json((folder / RECORD_FILE).read_bytes())
-                self.by_id[job.id] = job.model_copy(update={"folder": folder})
+                if job.id == folder.name:
+                    self.by_id[job.id] = job.model_copy(update={"folder": folder})
 
         # The photo that came first is completed first.
         for job in sorted(self.by_id.values(), key=lambda job: job.created):
             if job.ended is None:
-                self._change(job.id, state="queued")
                 self._enqueue(job.id)
 
-    def _enqueue(self, id: str) -> None:
-        """Let a job wait for a process."""
+    def _enqueue(self, id: str, line: str | None = None) -> None:
+        """Let a job wait for a process; `line` tells clients why it waits again."""
         with self._lock:
-            self._queue.append(id)
-            self._scene_threads.submit(self._run, id)
-
-    def _dequeue(self, id: str) -> None:
-        """Note that a job waits no more: it runs, or is deleted."""
-        with self._lock, contextlib.suppress(ValueError):
-            self._queue.remove(id)
+            if id not in self.by_id or self._is_closed.is_set():
+                return
+            stage = WARM_UP if self._is_warming_up else None
+            self._change(id, state="queued", stage=stage, share=None, line=line)
+            self._scene_orders[id] = self._scenes.submit(id, lambda order: self._run(order))
 
     def place_of(self, job: Job) -> int | None:
         """The number of jobs that come before one that waits; None for one that does not wait."""
-        if job.state != "queued":
-            return None
-        try:
-            return self._queue.index(job.id)
-        except ValueError:  # it has begun to run, or was deleted
-            return None
+        order = self._scene_orders.get(job.id)
+        return None if order is None else self._scenes.place_of(order)
 
     def page(self, count: int, after: tuple[float, str] | None, client: str) -> list[Job]:
         """Up to `count` jobs that a client may see, the newest first.
@@ -259,9 +314,8 @@ class Jobs:
         """InputError if no photo can be completed now, because the disk is full, for example."""
         if self._is_closed.is_set():
             raise InputError("the server ends")
-        with self._lock:
-            if not self._processes:
-                raise InputError("the first worker process has not started yet")
+        if not self._scenes.has_process:
+            raise InputError("the first worker process has not started yet")
         with as_input_error("the folder of scenes", "cannot be used: {reason}", OSError):
             free_bytes = shutil.disk_usage(self.folder).free
         if free_bytes < MIN_FREE_BYTES:
@@ -306,18 +360,15 @@ class Jobs:
         """
         if getattr(self._work, "prepares_for_photos", False):
             self._is_warming_up = True
-            self._scene_threads.submit(self._warm_up)
+            self._scenes.submit("", self._warm_up)
 
-    def _warm_up(self) -> None:
-        """Do the task `WARM_UP` in the process of the calling thread."""
-
-        def ignore_event(event: TaskEvent) -> None:
-            """Nobody waits for this work yet."""
-
+    def _warm_up(self, order: Order) -> TaskFailure | None:
+        """Do the task `WARM_UP` in a process."""
         try:
             # What goes wrong here goes wrong again with the first photo, whose sender is told.
-            error = self._process().do(WARM_UP, ignore_event)
-            LOG.debug("prepared for the first photo: %s", error or "done")
+            failure = order.do(WARM_UP, ignore_event)
+            LOG.debug("prepared for the first photo: %s", failure or "done")
+            return failure
         finally:
             self._is_warming_up = False
 
@@ -339,11 +390,7 @@ class Jobs:
             upload_count = len(list(self.folder.glob(f"{UPLOAD_PREFIX}*")))
             queued_count = sum(job.state == "queued" for job in self.by_id.values())
             if upload_count + queued_count >= self.limits.waiting:
-                raise HTTPException(
-                    429,
-                    f"too many photos are waiting: try again in {RETRY_AFTER_S} seconds",
-                    {"Retry-After": str(RETRY_AFTER_S)},
-                )
+                raise full_queue("photos")
             folder.mkdir()
         try:
             yield folder
@@ -391,149 +438,204 @@ class Jobs:
         if submission.key is not None:
             job = job.model_copy(update=submission.key._asdict())
         job.save()
-        if self._is_warming_up:
-            job = job.model_copy(update={"stage": WARM_UP})
         # `reserve_place` counts folders and jobs, so the two change together.
         with self._lock:
             job_folder = folder.rename(self.folder / id)
             job = job.model_copy(update={"folder": job_folder})
             self.by_id[id] = job
-        self._enqueue(id)
-        return job
+            self._enqueue(id)
+            return self.by_id[id]
 
-    def make_file(self, job: Job, file: str) -> Future[str | None]:
-        """Add a file to a finished scene, in a thread; returns at once.
+    def decode(self, task: DecodingTask) -> TaskFailure | None:
+        """Decode what a client has sent in a process of its own, and wait; None: it is whole."""
+        order = self._decoders.submit(
+            "", lambda order: order.do(task, ignore_event, DECODING_LIMITS)
+        )
+        return order.outcome.result()
 
-        The result of the future is None when the file is made, or the reason for failure.
+    @contextlib.contextmanager
+    def wait_for_file(self, job: Job, file: str, *, is_video: bool) -> Iterator[FileOrder]:
+        """Have a file added to a finished scene; the block waits for `order.outcome`.
+
+        Who asks for a file that is being made already waits for the same one. A file is given up
+        when the last client has left its block, unless another one comes at once.
 
         Args:
             job: of the scene.
             file: the name of the file, such as "scene.glb".
+            is_video: whether it may take minutes, so that it must not hold up other files.
+
+        Raises:
+            HTTPException: 429 if too many files wait.
         """
+        key = (job.id, file)
+        with self._lock:
+            file_order = self._file_orders.get(key)
+            if file_order is None:
+                file_order = self._order_file(job, file, is_video)
+            file_order.waiting_clients += 1
+        try:
+            yield file_order
+        finally:
+            with self._lock:
+                file_order.waiting_clients -= 1
+                if not file_order.waiting_clients and not file_order.order.outcome.done():
+                    timer = threading.Timer(
+                        ABANDONED_AFTER_S, self._give_up_if_unwanted, [file_order]
+                    )
+                    timer.daemon = True
+                    timer.start()
 
-        def ignore_event(event: TaskEvent) -> None:
-            """The progress of a single file is not shown."""
+    def _order_file(self, job: Job, file: str, is_video: bool) -> FileOrder:
+        """Order a file that nobody has ordered yet; the caller holds the lock."""
+        lane = self._videos if is_video else self._small_files
+        if lane.waiting_count >= self.limits.waiting:
+            raise full_queue("files")
+        if job.id not in self.by_id:  # it has been deleted in this moment
+            raise HTTPException(404, "there is no such scene")
+        limits = TaskLimits(seconds=self.limits.work_s or FILE_LIMIT_S)
 
-        def add_file() -> str | None:
-            return self._process().do((job, file), ignore_event)
+        def add_file(order: Order) -> TaskFailure | None:
+            return order.do((job, file), lambda event: file_order.note_event(event), limits)
 
-        return self._file_thread.submit(add_file)
+        # It cannot begin, and report, before `file_order` exists, but this name is looked up then.
+        with lane.lock:
+            file_order = FileOrder(lane.submit(job.id, add_file))
+        key = (job.id, file)
+        self._file_orders[key] = file_order
+        file_order.order.outcome.add_done_callback(lambda outcome: self._forget_file(file_order))
+        return file_order
+
+    def _forget_file(self, file_order: FileOrder) -> None:
+        """Note that a file is not being made any more: who asks for it from now on orders it."""
+        # Without the lock, because a lane that holds its own lock may call this.
+        for key, each in list(self._file_orders.items()):
+            if each is file_order:
+                self._file_orders.pop(key, None)
+
+    def _give_up_if_unwanted(self, file_order: FileOrder) -> None:
+        """End the work on a file that nobody waits for."""
+        with self._lock:
+            if not file_order.waiting_clients:
+                self._forget_file(file_order)
+                file_order.order.lane.cancel(file_order.order)
+
+    def files_in_work(self, id: str) -> list[FileProgress]:
+        """The files of a scene that clients wait for."""
+        return [
+            FileProgress(file=file, place=each.order.lane.place_of(each.order), share=each.share)
+            for (owner, file), each in list(self._file_orders.items())
+            if owner == id
+        ]
 
     def remove(self, id: str) -> None:
-        """Delete a job and its files, and kill the process that works on it."""
+        """Delete a job and its files, and end all work on it."""
         with self._lock:
             job = self.by_id.pop(id, None)
-            self._dequeue(id)
-            process = self._process_of_job.pop(id, None)
-            if process is not None:
-                process.kill()
-        if job is not None:
-            shutil.rmtree(job.folder, ignore_errors=True)
+            self._scene_orders.pop(id, None)
+            for lane in self._lanes:
+                lane.cancel_all_of(id)
+            if job is None:
+                return
+            # Under its new name, nobody writes into the folder any more: who is about to does not
+            # find it.
+            doomed_folder = self.folder / f"{DELETED_PREFIX}{id}"
+            with contextlib.suppress(OSError):
+                job.folder.rename(doomed_folder)
+        for folder in (doomed_folder, job.folder):
+            shutil.rmtree(folder, ignore_errors=True)
 
     def close(self) -> None:
         """Kill the processes; jobs resume when a server next opens the folder."""
         with self._lock:
             self._is_closed.set()
             self.callbacks.close()
-            for process in self._processes:
-                process.kill()
         # The threads see that their processes are gone, and end.
-        for pool in (self._scene_threads, self._file_thread):
-            pool.shutdown(cancel_futures=True)
+        for lane in self._lanes:
+            lane.close()
         self._folder_lock.close()  # another server may open the folder
 
-    def _take_gpu_number(self) -> None:
-        """Give the calling thread, and so its process, the next number of a GPU, if any is left."""
-        self._own_process.gpu_number = next(self._gpu_numbers, None)
-
-    def _process(self) -> TaskProcess:
-        """The worker process of the calling thread; a new one if there is none, or it died."""
-        # `_own_process` holds another value in each thread.
-        process: TaskProcess | None = getattr(self._own_process, "process", None)
-        with self._lock:
-            # `close` kills the processes. A process that died after that is not replaced: it is
-            # returned dead, and the tasks that it gets fail.
-            is_dead = process is not None and not process.alive
-            if process is None or (is_dead and not self._is_closed.is_set()):
-                # A process that replaces a dead one takes over its GPU.
-                gpu_number = getattr(self._own_process, "gpu_number", None)
-                process = TaskProcess(self._work, gpu_number)
-                self._own_process.process = process
-                alive = [each for each in self._processes if each.alive]
-                self._processes = [*alive, process]
-        return process
-
-    def _run(self, id: str) -> None:
-        """Give a job's photo to the thread's process, wait for the scene, and record the end.
+    def _run(self, order: Order) -> TaskFailure | None:
+        """Give a job's photo to a process, wait for the scene, and record the end.
 
         Nothing is recorded if the server is closed meanwhile: the next server repeats the job.
         """
-        process = self._process()
+        id = order.owner
         with self._lock:
-            self._dequeue(id)
             if self._is_closed.is_set() or id not in self.by_id:
-                return
-            self._change(id, state="running", stage=None)
-            self._process_of_job[id] = process
+                return CANCELLED
+            attempts = self.by_id[id].attempts + 1
+            self._change(id, state="running", stage=None, line=None, attempts=attempts)
             job = self.by_id[id]
 
         start = time.monotonic()
+        failure = self._make_scene(job, order)
+        # A signal to end the whole service may reach the worker process first. Up to a second
+        # passes until this process is closed, too, and then the job has not failed.
+        if failure is not None and failure.kind == "died":
+            self._is_closed.wait(1)
+        with self._lock:
+            if self._is_closed.is_set() or id not in self.by_id:
+                return failure
+            self._scene_orders.pop(id, None)
+            self._end_or_repeat(job, failure, time.monotonic() - start)
+        return failure
+
+    def _make_scene(self, job: Job, order: Order) -> TaskFailure | None:
+        """Make the scene of a job in an empty folder of results; returns why it failed, or None."""
         try:
             # An earlier server may have been stopped in the middle of this job.
             shutil.rmtree(job.results, ignore_errors=True)
             job.results.mkdir()
             job.save()
-            task = (job, None)  # None: the scene, not a further file of it
-            # The reason why the scene could not be made; None if it is finished.
-            with self._time_limit(id, process):
-                error = process.do(task, lambda event: self._note_event(id, event))
         except (OSError, InputError) as problem:
-            error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
+            kind: Any = "input" if machine_fault(problem) is None else "machine"
+            return TaskFailure(kind, f"cannot be stored here: {reason_in_a_line(problem)}")
+        task = (job, None)  # None: the scene, not a further file of it
+        limits = TaskLimits(seconds=self.limits.work_s)
+        return order.do(task, lambda event: self._note_event(job.id, event), limits)
 
-        # A signal to end the whole service may reach the worker process first. Up to a second
-        # passes until this process is closed, too, and then the job has not failed.
-        if error == WORKER_DIED:
-            self._is_closed.wait(1)
-        with self._lock:
-            self._process_of_job.pop(id, None)
-            if id in self._timed_out:
-                self._timed_out.discard(id)
-                error = f"{job.name}: took longer than {self.limits.work_s:g} seconds, the limit"
-            if not self._is_closed.is_set() and id in self.by_id:
-                state = "failed" if error else "done"
-                former = self.work_times[state]
-                seconds = former.seconds + time.monotonic() - start
-                self.work_times[state] = WorkTimes(former.jobs + 1, seconds)
-        if not self._is_closed.is_set():
-            self._record_end(id, error)
+    def _end_or_repeat(self, job: Job, failure: TaskFailure | None, seconds: float) -> None:
+        """Record how the work on a job has ended, or let it wait again; the lock is held.
 
-    @contextlib.contextmanager
-    def _time_limit(self, id: str, process: TaskProcess) -> Iterator[None]:
-        """Kill the process of a job if the block takes longer than the limit."""
-        if self.limits.work_s is None:
-            yield
+        Args:
+            job: the job.
+            failure: why there is no scene; None: it is finished.
+            seconds: how long the work took.
+        """
+        # What is this machine's fault is not the photo's.
+        if failure is not None and failure.kind == "machine":
+            self._try_later(job.id, failure.line)
             return
+        if failure is not None and failure.kind == "died" and job.attempts < MAX_ATTEMPTS:
+            self._enqueue(job.id)
+            return
+        try:
+            self._record_end(job.id, None if failure is None else error_line(job.name, failure))
+        except (OSError, InputError) as problem:
+            self._try_later(job.id, reason_in_a_line(machine_fault(problem) or problem))
+            return
+        state = "done" if failure is None else "failed"
+        former = self.work_times[state]
+        self.work_times[state] = WorkTimes(former.jobs + 1, former.seconds + seconds)
 
-        def end_job() -> None:
-            with self._lock:
-                # The job may have ended in this moment, and the process may have another one.
-                if self._process_of_job.get(id) is process:
-                    self._timed_out.add(id)
-                    process.kill()
+    def _try_later(self, id: str, reason: str) -> None:
+        """Keep a photo that this machine cannot complete now, and try again after a while.
 
-        timer = threading.Timer(self.limits.work_s, end_job)
+        The lock is held.
+        """
+        LOG.error("error: %s: %s: kept, and tried again", self.by_id[id].name, reason)
+        line = without_folders(f"the server cannot go on now ({reason}): it will try again")
+        self._change(id, state="queued", stage=None, share=None, line=line, attempts=0)
+        timer = threading.Timer(RETRY_S, self._enqueue, [id, line])
         timer.daemon = True
         timer.start()
-        try:
-            yield
-        finally:
-            timer.cancel()
 
     def _note_event(self, id: str, event: TaskEvent) -> None:
         """Note in a job's state what its process reports: {line}, or a `StageProgress`."""
         if "line" in event:
             LOG.info(event["line"])
-            self._change(id, line=event["line"])
+            self._change(id, line=without_folders(event["line"]))
             return
         update = StageProgress(**event)
         self._change(id, stage=update.stage, share=update.share)
@@ -541,29 +643,29 @@ class Jobs:
     def _record_end(self, id: str, error: str | None) -> None:
         """Record a job's end on the disk, then tell clients; delete the photo, which is private.
 
-        `error` is the reason for failure, None for a finished scene.
+        The lock is held. OSError or InputError if the end cannot be recorded: then it has not come.
+
+        Args:
+            id: of the job.
+            error: the reason for failure, None for a finished scene.
         """
-        with self._lock:
-            job = self.by_id.get(id)
-            if job is None:
-                return
-            ended_job = job.model_copy(
-                update={
-                    "state": "failed" if error else "done",
-                    "error": error,
-                    "ended": time.time(),
-                    "stage": None,
-                    "share": None,
-                }
-            )
-            # If the disk is full, the next server repeats the job, and needs the photo.
-            with contextlib.suppress(InputError):
-                ended_job.save()
-                for file in (job.source, job.depth, job.mask):
-                    # An absolute path is a file of the user, which is not ours to delete.
-                    if file is not None and not os.path.isabs(file):
-                        (job.folder / file).unlink(missing_ok=True)
-            self.by_id[id] = ended_job
+        job = self.by_id[id]
+        ended_job = job.model_copy(
+            update={
+                "state": "failed" if error else "done",
+                "error": error,
+                "ended": time.time(),
+                "stage": None,
+                "share": None,
+            }
+        )
+        ended_job.save()
+        self.by_id[id] = ended_job
+        for file in (job.source, job.depth, job.mask):
+            # An absolute path is a file of the user, which is not ours to delete.
+            if file is not None and not os.path.isabs(file):
+                with contextlib.suppress(OSError):
+                    (job.folder / file).unlink(missing_ok=True)
         if ended_job.callback_url is not None:
             self.callbacks.schedule(id, ended_job.callback_url, ended_job.client)
         if error:
@@ -592,6 +694,17 @@ class Jobs:
             if is_old or total_size > self.limits.size:
                 total_size -= sizes[id]
                 self.remove(id)
+
+
+def error_line(name: str, failure: TaskFailure) -> str:
+    """Why a photo or a file called `name` was not made, as clients may read it."""
+    line = without_folders(failure.line)
+    # Other lines name the photo already, or blame the server.
+    return f"{name}: {line}" if failure.kind in ("time", "memory") else line
+
+
+def ignore_event(event: TaskEvent) -> None:
+    """Nobody watches the progress of this work."""
 
 
 def age_key(job: Job) -> tuple[float, str]:

@@ -31,10 +31,11 @@ from spackle.views import PathOptions
 from spackle.web.app import create_app, make_server
 from spackle.web.callbacks import CallbackSender
 from spackle.web.clients import Client
+from spackle.web.decoding import check_photo
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, RetentionLimits
 from spackle.web.public_address import LOCAL_ONLY, PublicAddress
-from spackle.web.work import PREVIEW, SceneWork, check_photo
+from spackle.web.work import PREVIEW, SceneWork
 
 # Hosts at which a server accepts connections from everywhere, and the address on this machine.
 LOOPBACK_OF_ANY_HOST = {"0.0.0.0": "127.0.0.1", "::": "::1"}

@@ -24,10 +24,12 @@ from spackle.depth.readers import DEPTH_SUFFIXES
 from spackle.formats.camera_files import CameraEntry, camera_from_json
 from spackle.runtime.errors import InputError, printable_line, unknown_name
 from spackle.runtime.validation import validation_problem
+from spackle.web.decoding import DecodingTask, MaskCheck, PhotoCheck
 from spackle.web.description import BINARY_FILE, describe_form
-from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE, sent_mask
+from spackle.web.edits import EDIT_SOURCE, FORMER_PAGE, MASK_FILE
+from spackle.web.failures import refusal_of
 from spackle.web.jobs import Edit, Job, Jobs, Submission
-from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions, check_photo
+from spackle.web.work import PAGE, PREVIEW, SCENE_FILE, SceneOptions
 
 MAX_NAME_CHARACTERS = 80
 MAX_VIEWS = 32  # of a fill
@@ -123,10 +125,10 @@ def accept_photo(
         depth_file = store_upload(depth, upload_folder, f"depth{depth_suffix(depth)}")
 
     # Only decoding shows whether a photo is whole.
-    try:
-        check_photo(upload_folder / photo_file, photo_name, upload_folder / PREVIEW)
-    except InputError as error:
-        raise HTTPException(415, str(error)) from error
+    photo_check = PhotoCheck(
+        path=upload_folder / photo_file, name=photo_name, preview=upload_folder / PREVIEW
+    )
+    _decode(photo_check, photo_name, jobs)
     # Options that the client has not set stay away, so that the server's defaults apply to them.
     given_options = options.model_dump(exclude_unset=True)
     return jobs.add(
@@ -179,12 +181,23 @@ def accept_removal(
     if not isinstance(mask, UploadFile):
         raise HTTPException(422, "send the mask as the file `mask`")
     store_upload(mask, upload_folder, MASK_FILE)
-    try:
-        sent_mask(upload_folder / MASK_FILE, camera_from_json(camera, "camera"))
-    except InputError as error:
-        raise HTTPException(415, str(error)) from error
+    _decode(MaskCheck(path=upload_folder / MASK_FILE, camera=camera), "mask", jobs)
     edit = Edit("remove", parent.id, [camera], MASK_FILE)
     return _add_edit(edit, upload_folder, jobs, parent, submission)
+
+
+def _decode(task: DecodingTask, name: str, jobs: Jobs) -> None:
+    """Decode a stored file in a process of its own.
+
+    HTTPException: 415 if the file called `name` is damaged, or takes too much time or memory; 507
+    if this machine's disk is full.
+    """
+    failure = jobs.decode(task)
+    if failure is None:
+        return
+    if failure.kind in ("time", "memory", "died"):
+        failure = failure._replace(line=f"{name}: cannot be decoded: {failure.line}")
+    raise refusal_of(failure, 415)
 
 
 def _edit_options(form: FormData, model: type[MODEL]) -> MODEL:

@@ -17,10 +17,6 @@ from rich.console import Console
 
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, BaseSettings
-from spackle.core.color import to_uint8
-from spackle.core.image_files import OpenPicture, read_picture
-from spackle.core.photo import check_photo_size, refuse_if_not_flat
-from spackle.core.srgb_pictures import picture_to_srgb
 from spackle.core.trajectories import TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import DepthKind
 from spackle.formats.camera_files import camera_from_json
@@ -81,7 +77,6 @@ PREVIEW = "photo.jpg"  # the small photo that the page shows until the scene is 
 # What the page says of a scene whose depth a small network has guessed.
 ROUGH_DEPTH_NOTE = "Rough depth: a quick guess."
 WARM_UP_SIDE_PX = 64  # pixels of the picture with which a process prepares
-PREVIEW_SIDE_PX = 1280  # pixels of the preview's long side
 
 
 def declared_field(name: str, **changes: Any) -> Any:
@@ -382,32 +377,3 @@ class JobReporter(Reporter):
     def log(self, line: str) -> None:
         """Send a line to the server."""
         self._send_event({"line": self.without_paths(line)})
-
-
-def check_photo(path: Path, name: str, preview: Path) -> None:
-    """Decode a photo, and write a small JPEG of it, which the page shows until the scene is ready.
-
-    Args:
-        path: the photo.
-        name: what messages call it.
-        preview: the file for the small JPEG.
-
-    Raises:
-        InputError: the file is no photo of an accepted format, or too small or too large.
-    """
-
-    def write_preview(picture: OpenPicture) -> None:
-        """Check the photo at `path`, which is open, and write the small JPEG, upright and in sRGB.
-
-        `path` and `preview` are arguments of `check_photo`.
-        """
-        refuse_if_not_flat(picture, path)
-        check_photo_size(picture.image.width, picture.image.height, path)
-        # Decodes all pixels, and so finds damage.
-        small = picture_to_srgb(picture, path, max_side=PREVIEW_SIDE_PX)
-        Image.fromarray(to_uint8(small.rgb).numpy()).save(preview, quality=85)
-
-    try:
-        read_picture(path, write_preview)
-    except InputError as error:
-        raise InputError(str(error).replace(str(path), name)) from error
