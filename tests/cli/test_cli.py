@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import time
 from importlib.metadata import entry_points
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -131,6 +133,41 @@ def test_a_full_standard_output_is_reported_in_one_line(scene: Path, tmp_path: P
         done.stderr.splitlines()[-1]
         == "error: cannot write to the standard output: No space left on device"
     )
+
+
+@pytest.mark.parametrize(
+    ("failure", "says"),
+    [
+        (MemoryError(), "not enough memory: close other programs, or give something smaller"),
+        (MemoryError("Unable to allocate 98 GiB"), "not enough memory (Unable to allocate 98 GiB)"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate"), "not enough memory: close"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), "cannot write to the standard output: Brok"),
+        (OSError(errno.EIO, "Input/output error"), "a file cannot be read or written: Input/outp"),
+        (OSError(errno.EIO, "Bad disk", "a.ply", None, "b.ply"), "a.ply: cannot be read or writt"),
+        (
+            PermissionError(errno.EACCES, "Denied", b"x\xff.ply"),
+            "x\ufffd.ply: cannot be read or wr",
+        ),
+    ],
+)
+def test_a_failure_of_memory_disk_or_pipe_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception, says: str
+) -> None:
+    def fail(**options: object) -> None:
+        raise failure
+
+    monkeypatch.setattr("spackle.cli.app", fail)
+    result = run("info", "a.ply")
+    refuses(result, says)
+    assert result.err.startswith(f"error: {says}")
+    assert json.loads(run("info", "a.ply", "--json").out)["error"].startswith(says)
+
+
+def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    for fault in (ValueError("a fault"), RuntimeError("another"), KeyError("a")):
+        monkeypatch.setattr("spackle.cli.app", mock.Mock(side_effect=fault))
+        with pytest.raises(type(fault)):
+            run("info", "a.ply")
 
 
 def test_every_command_has_a_help() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +29,8 @@ from safetensors.torch import save_file
 
 import spackle
 from spackle.core.focal_length import focal_mm_to_px
+from spackle.core.gaussians import Gaussians
+from spackle.formats.ply import save_ply
 from spackle.pipeline import FillOptions
 from spackle.results.results_file import RESULTS_NAME
 from spackle.runtime.folders import results_folder
@@ -289,6 +293,42 @@ def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
         bad in line for bad, line in zip(("c.png", "d.png", "e.png", "f.npy"), errors, strict=True)
     )
     assert result.lines[-1] == "4 of 7 photos failed"
+
+
+def test_a_disk_that_fails_for_one_photo_stops_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a.png", "b.png", "c.png"):
+        write_photo(tmp_path / "photos" / name)
+        write_depth(tmp_path / "depths" / f"{Path(name).stem}.npy")
+    move = os.replace
+
+    def move_or_fail(source: Path, target: Path) -> None:
+        if target == tmp_path / "out" / "a" / "scene.ply":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(source), None, str(target))
+        move(source, target)
+
+    def save_or_fail(gaussians: Gaussians, path: Path, **options: Any) -> None:
+        if path.parent.parent.name == "b":
+            raise MemoryError
+        save_ply(gaussians, path, **options)
+
+    monkeypatch.setattr("spackle.runtime.folders.os.replace", move_or_fail)
+    monkeypatch.setattr("spackle.results.photo_folder.save_ply", save_or_fail)
+    words = ("--depth", tmp_path / "depths", "-o", tmp_path / "out", "--no-render", "--json")
+    result = run("predict", tmp_path / "photos", *words)
+    errors = [line for line in result.lines if line.startswith("error: ")]
+    assert errors == [
+        f"error: {tmp_path / 'out' / 'a'}: cannot write: {os.strerror(errno.EIO)}",
+        "error: not enough memory to complete b.png: give a smaller photo, or close other programs",
+    ]
+    assert (result.code, result.lines[-1]) == (1, "2 of 3 photos failed")
+    assert names_in(tmp_path / "out") == {"c"}
+    assert [json.loads(line).get("error") is None for line in result.out.splitlines()] == [
+        False,
+        False,
+        True,
+    ]
 
 
 def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from spackle.render.protocol import (
     near_plane,
 )
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
+from spackle.render.tile_lists import tile_blocks
 from spackle.runtime.errors import InputError
 
 CPU, TWIN = CpuRenderer(), ReferenceRenderer()
@@ -482,3 +483,28 @@ def test_a_batch_of_views_equals_single_views(renderer):
 
 def test_renderers_name_their_device():
     assert CPU.device == TWIN.device == torch.device("cpu")
+
+
+@pytest.mark.parametrize("max_entries", [1, 700, 20_000])
+def test_a_picture_drawn_in_blocks_of_tiles_is_the_same_bit_by_bit(monkeypatch, max_entries):
+    camera = turned_camera(130, 100, 100.0)
+    scene = random_scene(6, 2000, camera)
+    # Equal depths keep the order of the Gaussians.
+    twins = Gaussians.cat([scene, dataclasses.replace(scene, colors=scene.colors.flip(0))])
+    tiles = torch.rand(7, 9, generator=torch.Generator().manual_seed(3)) < 0.7
+    whole = CPU.render(twins, camera)
+    some = CPU.render(twins, camera, tiles=tiles)
+    monkeypatch.setattr("spackle.render.drawing.MAX_ENTRIES_AT_ONCE", max_entries)
+    assert same_bits(CPU.render(twins, camera), whole)
+    assert same_bits(CPU.render(twins, camera, tiles=tiles), some)
+
+
+def test_lists_of_huge_gaussians_are_never_in_memory_all_together(monkeypatch):
+    lengths = np.random.default_rng(0).integers(0, 50, (12, 17))
+    for max_entries in (1, 49, 300, 10**6):
+        seen = np.zeros_like(lengths)
+        for block in tile_blocks(lengths, max_entries):
+            tiles = block.drawn(np.ones(lengths.shape, np.bool_))
+            seen += tiles
+            assert lengths[tiles].sum() <= max_entries or tiles.sum() == 1
+        assert (seen == 1).all()

@@ -33,6 +33,7 @@ from spackle.cli.options import INTERRUPTED, PAPER_PANEL
 from spackle.cli.predict import predict
 from spackle.cli.render import render
 from spackle.cli.serve import serve
+from spackle.cli.system_errors import problem_of_system
 from spackle.cli.tables import tables
 from spackle.cli.train import train
 from spackle.cli.view import view
@@ -168,13 +169,13 @@ def main() -> None:
             print(error.format_message(), file=sys.stderr)
             sys.exit(BAD_INPUT)
         _exit_with_error(with_suggestion(error))
-    except OSError as error:
-        # Without a file name it is the standard output that fails, such as a pipe to a full disk.
-        if error.filename is not None:
+    except Exception as error:
+        problem = problem_of_system(error)
+        if problem is None:
             raise
-        reason = error.strerror or error
-        print(f"error: cannot write to the standard output: {reason}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
+        # The traceback holds what filled the memory, and the message needs a little of it.
+        error.__traceback__ = None
+        _exit_with_error(problem)
 
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
@@ -213,5 +214,7 @@ def _exit_with_error(message: str) -> NoReturn:
     print(f"error: {line}", file=sys.stderr)
     # The error may have come before the options were parsed.
     if "--json" in sys.argv:
-        print(json.dumps({"error": line}))
+        # If the standard output has failed, nothing more can be said there.
+        with contextlib.suppress(OSError):
+            print(json.dumps({"error": line}), flush=True)
     sys.exit(BAD_INPUT)

@@ -53,4 +53,4 @@ class CpuRenderer(Renderer):
             inputs += background.tensors
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
             return draw_with_gradients(sets, view, drawn_tiles, background)
-        return draw(sets, view, drawn_tiles, background).rendering()
+        return draw(sets, view, drawn_tiles, background)

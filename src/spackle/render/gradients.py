@@ -23,7 +23,7 @@ from spackle.render.drawing import (
     TILES_PER_CHUNK,
     Drawing,
     as_array,
-    draw,
+    draw_for_gradients,
 )
 from spackle.render.project import Arrays, KernelCamera
 from spackle.render.protocol import Rendering, tile_mask
@@ -93,7 +93,7 @@ class DrawFunction(torch.autograd.Function):
             Gaussians(*fields[first : first + FIELDS_PER_SET])
             for first in range(0, len(fields), FIELDS_PER_SET)
         ]
-        drawing = draw(sets, view, drawn_tiles, background, keep_linear=True)
+        drawing = draw_for_gradients(sets, view, drawn_tiles, background)
         rendering = drawing.rendering()
 
         ctx.drawing = drawing

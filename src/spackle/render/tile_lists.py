@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,54 @@ class TileLists(NamedTuple):
     starts: Array  # [T + 1] int64: where each tile's list starts in `ids`, and the end of the last
 
 
-def list_tiles(boxes: Array, drawn_tiles: Array, part_size: int) -> TileLists:
+class TileBlock(NamedTuple):
+    """A rectangle of tiles whose lists are made at one time; ends are exclusive."""
+
+    first_column: int
+    last_column: int
+    first_row: int
+    last_row: int
+
+    def clip(self, boxes: Array) -> Array:
+        """The boxes [N, 4] of Gaussians as far as they lie in the block; others become empty."""
+        clipped = np.empty_like(boxes)
+        np.maximum(boxes[:, 0], self.first_column, out=clipped[:, 0])
+        np.minimum(boxes[:, 1], self.last_column, out=clipped[:, 1])
+        np.maximum(boxes[:, 2], self.first_row, out=clipped[:, 2])
+        np.minimum(boxes[:, 3], self.last_row, out=clipped[:, 3])
+        return clipped
+
+    def drawn(self, drawn_tiles: Array) -> Array:
+        """`drawn_tiles` [rows, columns] bool, in which all tiles outside of the block are False."""
+        mask = np.zeros_like(drawn_tiles)
+        rows = slice(self.first_row, self.last_row)
+        columns = slice(self.first_column, self.last_column)
+        mask[rows, columns] = drawn_tiles[rows, columns]
+        return mask
+
+
+def count_by_part(boxes: Array, drawn_tiles: Array, part_size: int) -> Array:
+    """How many Gaussians of each part touch each tile, [parts, tiles] int64.
+
+    Args:
+        boxes: [N, 4] uint16: the tiles that each Gaussian may touch, as first column, last column,
+            first row, last row (last exclusive).
+        drawn_tiles: [rows, columns] bool; other tiles are not counted.
+        part_size: the Gaussians are divided into parts of this size, one for a thread at a time.
+    """
+    parts = math.ceil(len(boxes) / part_size)
+    counts = np.zeros((parts, drawn_tiles.size), np.int64)
+    parallel_for_chunks(
+        lambda start, stop: count_entries(start, stop, part_size, boxes, drawn_tiles, counts),
+        parts,
+        chunk_length=1,
+    )
+    return counts
+
+
+def list_tiles(
+    boxes: Array, drawn_tiles: Array, part_size: int, counts: Array | None = None
+) -> TileLists:
     """List the Gaussians of each tile, in their own order.
 
     An *entry* is a Gaussian in the list of a tile. A Gaussian that touches three tiles has three.
@@ -34,16 +82,12 @@ def list_tiles(boxes: Array, drawn_tiles: Array, part_size: int) -> TileLists:
             first row, last row (last exclusive).
         drawn_tiles: [rows, columns] bool; lists of other tiles are empty.
         part_size: the Gaussians are divided into parts of this size, one for a thread at a time.
+        counts: what `count_by_part` gives for these arguments; None: it is called.
     """
     # Every part counts its entries of each tile. Then it is known where each part may write, and
     # the parts are independent.
-    parts = math.ceil(len(boxes) / part_size)
-    counts = np.zeros((parts, drawn_tiles.size), np.int64)  # entries by part and tile
-    parallel_for_chunks(
-        lambda start, stop: count_entries(start, stop, part_size, boxes, drawn_tiles, counts),
-        parts,
-        chunk_length=1,
-    )
+    if counts is None:
+        counts = count_by_part(boxes, drawn_tiles, part_size)
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     counts_of_earlier_parts = np.cumsum(counts, axis=0) - counts
     positions = starts[:-1] + counts_of_earlier_parts  # [parts, T]: of each part's first entry
@@ -53,10 +97,43 @@ def list_tiles(boxes: Array, drawn_tiles: Array, part_size: int) -> TileLists:
         lambda start, stop: write_entries(
             start, stop, part_size, boxes, drawn_tiles, positions, ids
         ),
-        parts,
+        len(counts),
         chunk_length=1,
     )
     return TileLists(ids, starts)
+
+
+def tile_blocks(list_lengths: Array, max_entries: int) -> Iterator[TileBlock]:
+    """Yield rectangles that cover all tiles, each with lists of at most `max_entries` entries.
+
+    A block has whole rows of tiles, or, where the lists of one row are too long, a part of a row.
+    A single tile may have a longer list.
+
+    Args:
+        list_lengths: [rows, columns] entries of each tile's list.
+        max_entries: bounds the memory that the lists of a block take.
+    """
+    row_count, column_count = list_lengths.shape
+    row_lengths = list_lengths.sum(axis=1)
+    first_row = 0
+    while first_row < row_count:
+        last_row = first_row + _leading_count(row_lengths[first_row:], max_entries)
+        if row_lengths[first_row] <= max_entries:
+            yield TileBlock(0, column_count, first_row, last_row)
+        else:
+            first_column = 0
+            while first_column < column_count:
+                rest = list_lengths[first_row, first_column:]
+                last_column = first_column + _leading_count(rest, max_entries)
+                yield TileBlock(first_column, last_column, first_row, last_row)
+                first_column = last_column
+        first_row = last_row
+
+
+def _leading_count(lengths: Array, max_entries: int) -> int:
+    """How many of the first `lengths` [n] have a sum of at most `max_entries`; at least 1."""
+    sums = np.cumsum(lengths)
+    return max(1, int(np.searchsorted(sums, max_entries, side="right")))
 
 
 @kernel

@@ -34,8 +34,9 @@ from spackle.results.photo_folder import (
     read_earlier_report,
 )
 from spackle.results.results_file import ResultsFile
+from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.folders import results_folder
 from spackle.runtime.kernels import is_compiled
@@ -413,11 +414,19 @@ class Predictor:
         folder = self.output / photo.name
         start = time.perf_counter()
         try:
-            facts = self._input_facts(photo)
-            request = self.request_digest(photo)
-            report = predict_photo(
-                photo.path, folder, self.pipeline, reporter, self.options.photo, request
-            )
+            # Whatever fails with this photo alone, such as a disk that breaks or the memory for a
+            # large picture, is an error of this photo.
+            with (
+                as_input_error(photo.path, "cannot be completed: {reason}", OSError),
+                report_memory_shortage(
+                    "give a smaller photo", what=f"to complete {photo.path.name}"
+                ),
+            ):
+                facts = self._input_facts(photo)
+                request = self.request_digest(photo)
+                report = predict_photo(
+                    photo.path, folder, self.pipeline, reporter, self.options.photo, request
+                )
         except InputError as error:
             # A BaseError means that the base fails for every photo. Any other error is that of one
             # photo, and must not cost the user the photos after it.

@@ -75,6 +75,14 @@ def use_gpu(number: int | None) -> None:
         torch.cuda.set_device(number % torch.cuda.device_count())
 
 
+def is_memory_shortage(error: BaseException) -> bool:
+    """Whether an exception of Python, NumPy or torch means that the memory is too small."""
+    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+        return True
+    is_known_phrase = any(phrase in str(error) for phrase in _SHORTAGE_PHRASES)
+    return isinstance(error, RuntimeError) and is_known_phrase
+
+
 @contextmanager
 def report_memory_shortage(*advice: str, what: str = "for the network") -> Iterator[None]:
     """Turn a shortage of memory in the block, on the CPU or GPU, into a `NotEnoughMemory`.
@@ -86,10 +94,7 @@ def report_memory_shortage(*advice: str, what: str = "for the network") -> Itera
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        is_shortage = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or any(
-            phrase in str(error) for phrase in _SHORTAGE_PHRASES
-        )
-        if not is_shortage:
+        if not is_memory_shortage(error):
             raise
         remedies = ", or ".join([*advice, "close other programs"])
         raise NotEnoughMemory(f"not enough memory {what}: {remedies}") from error

@@ -117,6 +117,9 @@ def atomic_files(folder: Path, last: str) -> Iterator[Path]:
         folder: where the set belongs.
         last: name of one file of the set. An old one is deleted before the other files are
             replaced, and the new one comes last, so that its presence means a complete set.
+
+    Raises:
+        InputError: the files cannot be written or moved.
     """
     new_folder = folder / NEW_SET_NAME
     try:
@@ -126,11 +129,20 @@ def atomic_files(folder: Path, last: str) -> Iterator[Path]:
             new_folder.mkdir()
         yield new_folder
 
-        (folder / last).unlink(missing_ok=True)
-        files = [file for file in sorted(new_folder.rglob("*")) if file.is_file()]
-        names = [file.relative_to(new_folder) for file in files]
-        names.sort(key=lambda name: name == Path(last))  # True sorts last, so `last` comes last
-        for name in names:
-            os.replace(new_folder / name, folder / name)
+        with as_input_error(folder, "cannot write: {reason}", OSError):
+            _move_files(new_folder, folder, last)
     finally:
         shutil.rmtree(new_folder, ignore_errors=True)
+
+
+def _move_files(new_folder: Path, folder: Path, last: str) -> None:
+    """Move all files below `new_folder` to the same places in `folder`.
+
+    `last` is the name of the file that comes last; an old one is deleted first.
+    """
+    (folder / last).unlink(missing_ok=True)
+    files = [file for file in sorted(new_folder.rglob("*")) if file.is_file()]
+    names = [file.relative_to(new_folder) for file in files]
+    names.sort(key=lambda name: name == Path(last))  # True sorts last, so `last` comes last
+    for name in names:
+        os.replace(new_folder / name, folder / name)
