@@ -37,6 +37,7 @@ class GltfFile:
     path: Path
     description: dict[str, Any]
     binary_part: bytes  # of a .glb; empty for a .gltf
+    byte_count: int  # of the file, and of files beside it that were read so far
     _buffers: dict[int, bytes] = dataclasses.field(default_factory=dict)
 
     @staticmethod
@@ -59,7 +60,7 @@ class GltfFile:
         if not str(version).startswith("2."):
             problem = f"glTF version {short_repr(version)} (version 2 is read)"
             raise UnsupportedSceneError(f"{problem}: save it as version 2, or as PLY")
-        return GltfFile(path, description, binary_part)
+        return GltfFile(path, description, binary_part, len(data))
 
     def item(self, kind: str, index: Any) -> dict[str, Any]:
         """Return an entry of one of the lists of the JSON, such as "nodes".
@@ -154,7 +155,9 @@ class GltfFile:
         if not file.is_file() or file.stat().st_size > MAX_BUFFER_BYTES:
             problem = f"its data are in {short_repr(name)}, which is not there"
             raise UnsupportedSceneError(f"{problem}: put the file beside it")
-        return file.read_bytes()
+        content = file.read_bytes()
+        self.byte_count += len(content)
+        return content
 
 
 def _split_glb(data: bytes) -> tuple[bytes, bytes]:

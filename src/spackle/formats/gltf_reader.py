@@ -31,6 +31,7 @@ from spackle.formats.gaussian_columns import (
 from spackle.formats.gltf import EXTENSION
 from spackle.formats.gltf_file import GltfFile
 from spackle.formats.scene_content import DecodedScene, UnsupportedSceneError
+from spackle.formats.scene_limits import check_gaussian_count
 from spackle.formats.spz import decode_spz
 from spackle.runtime.errors import short_repr
 
@@ -49,7 +50,6 @@ SPZ_OF_SPLATTING = (
 )
 
 MAX_NODE_DEPTH = 64  # of a node in the tree; a deeper one is in a circle
-MAX_COUNT = 10_000_000  # most Gaussians of a file that shows the same ones several times
 
 # How far a rotation times its transpose may be from the identity.
 ROTATION_TOLERANCE = 1e-4
@@ -81,9 +81,10 @@ def read_gltf(path: Path) -> DecodedScene:
         degrees.append(degree)
         if is_own and "spackle_base" in node.get("extras", {}):
             base_count = int(node["extras"]["spackle_base"])
+        # A file may show the same Gaussians several times, but not any number of times.
         total_count = sum(len(part.means) for part in parts)
-        if total_count > max(MAX_COUNT, path.stat().st_size):
-            raise ValueError(f"it shows {total_count:,} Gaussians, more than it can hold")
+        most_harmonics = max(part.harmonics_degree for part in parts)
+        check_gaussian_count(total_count, most_harmonics, file.byte_count)
     if not parts:
         raise UnsupportedSceneError(_what_else(file))
 
@@ -97,6 +98,7 @@ def read_gltf(path: Path) -> DecodedScene:
         harmonics_degree=max(degrees),
         camera=_own_camera(file) if is_own else None,
         base_count=base_count,
+        byte_count=file.byte_count,
     )
 
 

@@ -32,8 +32,15 @@ from spackle.formats.gaussian_columns import (
     harmonics_to_srgb,
 )
 from spackle.formats.ply_layout import NoGaussiansError, PlyLayout, plain_name, view_harmonics
-from spackle.formats.ply_tables import NewTable, PlyElement, PlyTables, ply_header
+from spackle.formats.ply_tables import (
+    CHUNK_TABLE,
+    NewTable,
+    PlyElement,
+    PlyTables,
+    ply_header,
+)
 from spackle.formats.scene_content import SceneFile, left_out_note
+from spackle.formats.scene_limits import check_gaussian_count
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path
 
@@ -240,7 +247,7 @@ class PlyFile:
 
     def _format(self) -> str:
         """Return what the file's format is called."""
-        if self._tables.elements_named("chunk"):
+        if self._tables.is_compressed:
             return "compressed PLY"
         return "text PLY" if self._tables.is_text else "PLY"
 
@@ -256,7 +263,7 @@ class PlyFile:
 
     def _notes(self) -> tuple[str, ...]:
         """Return what had to be assumed about the Gaussians."""
-        if self._tables.elements_named("chunk"):
+        if self._tables.is_compressed:
             return ()
         return PlyLayout.find(self._vertex_element().fields).notes
 
@@ -274,9 +281,12 @@ class PlyFile:
                 of an opacity is allowed: SHARP writes one for an opacity of 1.
         """
         vertex = self._vertex_element()
-        chunk_elements = self._tables.elements_named("chunk")
-        if chunk_elements:
-            return self._compressed_gaussians(chunk_elements[0], vertex)
+        with as_input_error(self.path, "not a Gaussian scene: {reason}", ValueError):
+            check_gaussian_count(
+                vertex.row_count, self._harmonics_degree(), self._tables.file_bytes
+            )
+        if self._tables.is_compressed:
+            return self._compressed_gaussians(vertex)
 
         count = vertex.row_count
         layout = PlyLayout.find(vertex.fields)
@@ -413,12 +423,15 @@ class PlyFile:
             raise InputError(f"{self.path}: {problem}: not a Gaussian scene")
         vertex = elements[0]
 
-        if self._tables.elements_named("chunk"):
+        if self._tables.is_compressed:
             present = vertex.property_names
             missing = [name for name in PACKED_PROPERTIES if name not in present]
             if missing:
                 problem = f"its vertices have no {', '.join(missing)}"
                 raise InputError(f"{self.path}: not a Gaussian scene: {problem}")
+            if len(self._tables.elements_named(CHUNK_TABLE)) != 1:
+                problem = "its vertices are packed, and the table of their chunks is missing"
+                raise InputError(f"{self.path}: {problem}: export the scene again")
         else:
             with as_input_error(self.path, "not a Gaussian scene: {reason}", NoGaussiansError):
                 PlyLayout.find(vertex.fields)
@@ -430,13 +443,10 @@ class PlyFile:
             raise InputError(f"{self.path}: holds lists in or before its vertices: {advice}")
         return vertex
 
-    def _compressed_gaussians(self, chunk: PlyElement, vertex: PlyElement) -> Gaussians:
-        """Decode PlayCanvas's compressed layout.
-
-        Args:
-            chunk: the table of the bounds within which the vertices are stored.
-            vertex: the table of the Gaussians.
-        """
+    def _compressed_gaussians(self, vertex: PlyElement) -> Gaussians:
+        """Decode PlayCanvas's compressed layout; `vertex` is the table of the Gaussians."""
+        # The bounds within which the vertices are stored.
+        (chunk,) = self._tables.elements_named(CHUNK_TABLE)
         problem = "the compressed tables cannot be read: {reason}: export the scene again"
         with as_input_error(self.path, problem):
             chunk_rows = self._tables.rows(chunk)

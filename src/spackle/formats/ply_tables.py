@@ -48,6 +48,10 @@ NUMPY_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "asc
 MIN_TEXT_BYTES = 2  # of a number in a text file: a digit, and a space or the line's end
 TEXT_BLOCK_LINES = 1 << 13  # lines of a text file that are parsed at once
 
+# PlayCanvas's compressed files have a table of chunks, and names of packed columns begin like this.
+CHUNK_TABLE = "chunk"
+PACKED_PREFIX = "packed_"
+
 # The type, in `PlyElement.fields`, of a property that is a list, and so has no fixed size.
 LIST_TYPE = "list"
 
@@ -194,13 +198,22 @@ class PlyTables:
         return is_placed and not element.has_lists
 
     @property
+    def is_compressed(self) -> bool:
+        """Whether the vertices are packed between the bounds of chunks, or are said to be so."""
+        vertex_names = [
+            name for element in self.elements_named("vertex") for name in element.property_names
+        ]
+        has_packed_vertices = any(name.startswith(PACKED_PREFIX) for name in vertex_names)
+        return has_packed_vertices or bool(self.elements_named(CHUNK_TABLE))
+
+    @property
     def movable_vertices(self) -> PlyElement | None:
         """The table of Gaussians if its rows can be copied byte for byte, else None.
 
         They cannot in a text file, or in a compressed one, whose chunks refer to places of rows.
         """
         vertices = self.elements_named("vertex")
-        if self.is_text or self.elements_named("chunk") or len(vertices) != 1:
+        if self.is_text or self.is_compressed or len(vertices) != 1:
             return None
         return vertices[0] if self.has_known_place(vertices[0]) else None
 

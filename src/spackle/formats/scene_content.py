@@ -47,6 +47,7 @@ class DecodedScene:
     notes: tuple[str, ...] = ()
     camera: Camera | None = None  # of the photo
     base_count: int | None = None  # how many Gaussians come from the photo
+    byte_count: int = 0  # of all files that were read, if there may be several; 0 for a single one
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,6 +18,7 @@ from spackle.formats.scene_content import (
     UnsupportedSceneError,
     left_out_note,
 )
+from spackle.formats.scene_limits import check_gaussian_count
 from spackle.formats.sog import META_NAME, encode_sog
 from spackle.formats.sog_reader import is_sog_archive, read_sog, sog_byte_count
 from spackle.formats.splat import decode_splat, encode_splat
@@ -172,8 +173,12 @@ def load_scene(path: Path) -> SceneFile:
             raise InputError(f"{path}: {error}") from error
         except InputError as error:  # the reader does not know the file's name
             raise InputError(f"{path}: {error}") from error
-        if len(decoded.columns.means) == 0:
+        count = len(decoded.columns.means)
+        if count == 0:
             raise ValueError("it holds no Gaussians")
+        # The readers of packed formats have asked before they unpacked; this holds for all.
+        byte_count = decoded.byte_count or path.stat().st_size
+        check_gaussian_count(count, decoded.columns.harmonics_degree, byte_count)
         gaussians = decoded.columns.to_gaussians()
 
     notes = decoded.notes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import zipfile
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.core.image_files import open_image
-from spackle.core.spherical_harmonics import HARMONICS_COUNTS
+from spackle.core.spherical_harmonics import HARMONICS_COUNTS, degree_of_count
 from spackle.formats.gaussian_columns import (
     Floats,
     GaussianColumns,
@@ -28,29 +29,41 @@ from spackle.formats.quantization import (
     fractions_to_components,
 )
 from spackle.formats.scene_content import DecodedScene, UnsupportedSceneError
+from spackle.formats.scene_limits import check_gaussian_count, check_unpacked_bytes
 from spackle.formats.sog import (
     CODEBOOK_SIZE,
     FIRST_LARGEST_COMPONENT_CODE,
     LENGTH_FACTOR_KEY,
     MAX_IMAGE_SIDE_PX,
+    MAX_PALETTE_ENTRIES,
     MAX_POSITION_CODE,
     META_NAME,
     PALETTE_COLUMNS,
 )
 from spackle.runtime.errors import short_repr
 
-MAX_MEMBER_BYTES = 1 << 28  # of a file that is read
-
-# A small file that claims a huge image would fill the memory. An image of at most so many pixels is
-# harmless; a larger one has some bytes for its pixels, unless it is uniform.
-HARMLESS_PIXELS = 1 << 22
-MAX_PIXELS_PER_BYTE = 64
+MAX_META_BYTES = 1 << 22  # of the description, which has some thousands
 
 # A description with so many harmonics has this degree.
 DEGREE_OF_HARMONICS = {3: 1, 8: 2, 15: 3}
 
-# Reads a file of a scene by its name.
-ReadMember = Callable[[str], bytes]
+
+@dataclasses.dataclass(frozen=True)
+class SogFiles:
+    """The files of a scene, in a zip archive or in a folder."""
+
+    read: Callable[[str], bytes]  # the content of the file of this name
+    stored_bytes: Callable[[str], int]  # its size, compressed as it may be
+    byte_count: int = 0  # of all files of the scene; 0 until the description is read
+
+    def with_byte_count(self, meta: Mapping[str, Any]) -> SogFiles:
+        """The same files, with the size of all that a description names."""
+        names = {META_NAME}
+        for part in ("means", "scales", "quats", "sh0", "shN"):
+            if meta.get(part) is not None:
+                names.update(meta[part]["files"])
+        byte_count = sum(self.stored_bytes(name) for name in names)
+        return dataclasses.replace(self, byte_count=byte_count)
 
 
 def read_sog(path: Path) -> DecodedScene:
@@ -60,20 +73,22 @@ def read_sog(path: Path) -> DecodedScene:
         UnsupportedSceneError: a zip archive of something else, or an unknown version.
         Exception: any exception, if the scene is damaged.
     """
-    with _open_members(path) as read_member:
-        meta = json.loads(read_member(META_NAME))
+    with _open_files(path) as files:
+        meta = json.loads(files.read(META_NAME))
         _check_meta(meta)
+        files = files.with_byte_count(meta)
         # The first version does not name itself, and its number of Gaussians is that of a table.
         version = meta.get("version", 1)
         count = int(meta["count"] if version == 2 else meta["means"]["shape"][0])
+        check_gaussian_count(count, 0, files.byte_count)  # harmonics are checked on their own
         # Pixels [N, 4] of each image. A position is in two images: its lower and upper bytes.
-        low_bytes, high_bytes = _read_images(read_member, meta["means"]["files"], count)
-        (scale_codes,) = _read_images(read_member, meta["scales"]["files"], count)
-        (rotation_codes,) = _read_images(read_member, meta["quats"]["files"], count)
-        (color_codes,) = _read_images(read_member, meta["sh0"]["files"], count)
+        low_bytes, high_bytes = _read_images(files, meta["means"]["files"], count)
+        (scale_codes,) = _read_images(files, meta["scales"]["files"], count)
+        (rotation_codes,) = _read_images(files, meta["quats"]["files"], count)
+        (color_codes,) = _read_images(files, meta["sh0"]["files"], count)
         view_harmonics = None
         if meta.get("shN") is not None:
-            view_harmonics = _read_harmonics(read_member, meta["shN"], count)
+            view_harmonics = _read_harmonics(files, meta["shN"], count)
 
     position_codes = high_bytes[:, :3] * np.uint32(256) + low_bytes[:, :3]
     opacities = codes_to_fractions(color_codes[:, 3], 255)
@@ -100,27 +115,26 @@ def read_sog(path: Path) -> DecodedScene:
         format=f"SOG {version}",
         writer=_generator(meta),
         harmonics_degree=_harmonics_degree(meta.get("shN")),
+        byte_count=files.byte_count,
     )
 
 
-def _read_harmonics(
-    read_member: ReadMember, palette: Mapping[str, Any], count: int
-) -> Floats | None:
+def _read_harmonics(files: SogFiles, palette: Mapping[str, Any], count: int) -> Floats | None:
     """Read the coefficients [N, K, 3] of K harmonics; None if there are none.
 
     Gaussians have a number of a palette's entry, whose coefficients are pixels of an image: K in a
     row for each entry, 64 entries side by side.
 
     Args:
-        read_member: reads a file of the scene.
+        files: of the scene.
         palette: the part of a description about harmonics above degree 0.
         count: N.
 
     Raises:
-        ValueError: the image of the palette has another width.
+        ValueError: the image of the palette has another size, or the file is too small for so much.
     """
     centroids_name, labels_name = palette["files"]
-    with open_image(io.BytesIO(read_member(centroids_name)), ("WEBP", "PNG")) as image:
+    with open_image(io.BytesIO(files.read(centroids_name)), ("WEBP", "PNG")) as image:
         width, height = image.size
     harmonics_count = width // PALETTE_COLUMNS
     if harmonics_count == 0:
@@ -128,15 +142,18 @@ def _read_harmonics(
     if harmonics_count not in HARMONICS_COUNTS or width % PALETTE_COLUMNS:
         raise ValueError(f"{centroids_name} is {width} pixels wide: no palette of harmonics")
 
+    check_gaussian_count(count, degree_of_count(harmonics_count), files.byte_count)
     entry_count = PALETTE_COLUMNS * height
-    (codes,) = _read_images(read_member, [centroids_name], entry_count * harmonics_count)
+    if entry_count > MAX_PALETTE_ENTRIES:
+        raise ValueError(f"{centroids_name} has {entry_count:,} entries: too many for a palette")
+    (codes,) = _read_images(files, [centroids_name], entry_count * harmonics_count)
     if "codebook" in palette:
         coefficients = _look_up_codes(codes[:, :3], palette["codebook"])
     else:  # version 1 has two bounds for all
         low = np.float32(palette["mins"])
         high = np.float32(palette["maxs"])
         coefficients = low + (high - low) * codes_to_fractions(codes[:, :3], 255)
-    (label_codes,) = _read_images(read_member, [labels_name], count)
+    (label_codes,) = _read_images(files, [labels_name], count)
     labels = label_codes[:, 1] * np.uint32(256) + label_codes[:, 0]
     if labels.max() >= entry_count:
         raise ValueError(f"entry {labels.max()} of a palette of {entry_count}")
@@ -196,8 +213,8 @@ def _harmonics_degree(harmonics: Any) -> int:
 
 
 @contextlib.contextmanager
-def _open_members(path: Path) -> Iterator[ReadMember]:
-    """Yield the function that reads a file of a scene by its name.
+def _open_files(path: Path) -> Iterator[SogFiles]:
+    """Yield the files of a scene.
 
     Args:
         path: a zip archive, a folder, or the description in a folder.
@@ -208,7 +225,15 @@ def _open_members(path: Path) -> Iterator[ReadMember]:
     if path.is_dir() or not zipfile.is_zipfile(path):
         folder = path if path.is_dir() else path.parent
         description = META_NAME if path.is_dir() else path.name
-        yield lambda name: _read_sibling(folder, description if name == META_NAME else name)
+
+        def sibling(name: str) -> Path:
+            """The file of a name; the description may have another one."""
+            return _sibling(folder, description if name == META_NAME else name)
+
+        yield SogFiles(
+            read=lambda name: _read_sibling(sibling(name)),
+            stored_bytes=lambda name: sibling(name).stat().st_size,
+        )
         return
 
     with zipfile.ZipFile(path) as archive:
@@ -218,7 +243,10 @@ def _open_members(path: Path) -> Iterator[ReadMember]:
             advice = "unpack it, and give the scene inside"
             raise UnsupportedSceneError(f"a zip archive without the meta.json of a SOG: {advice}")
         prefix = min(names, key=len).removesuffix(META_NAME)
-        yield lambda name: _read_member(archive, prefix + name)
+        yield SogFiles(
+            read=lambda name: _read_member(archive, prefix + name),
+            stored_bytes=lambda name: archive.getinfo(prefix + name).compress_size,
+        )
 
 
 def is_sog_archive(path: Path) -> bool:
@@ -230,12 +258,11 @@ def is_sog_archive(path: Path) -> bool:
         return False  # the reader of another format reports the damage
 
 
-def _read_sibling(folder: Path, name: str) -> bytes:
-    """Read a file in a folder.
+def _sibling(folder: Path, name: str) -> Path:
+    """The path of a file in a folder.
 
     Raises:
-        ValueError: the name leads out of the folder, or the file is too large.
-        OSError: there is no such file.
+        ValueError: the name leads out of the folder, or there is no such file.
     """
     # A description names its images; a hostile one may not reach other files of this machine.
     if Path(name).name != name:
@@ -243,9 +270,20 @@ def _read_sibling(folder: Path, name: str) -> bytes:
     path = folder / name
     if not path.is_file():
         raise ValueError(f"there is no {short_repr(name)} beside {META_NAME}")
-    if path.stat().st_size > MAX_MEMBER_BYTES:
-        raise ValueError(f"{name} is too large")
+    return path
+
+
+def _read_sibling(path: Path) -> bytes:
+    """Read a file in a folder; ValueError if it is too large for what it is."""
+    _check_file_size(path.name, path.stat().st_size, path.stat().st_size)
     return path.read_bytes()
+
+
+def _check_file_size(name: str, unpacked_bytes: int, stored_bytes: int) -> None:
+    """Raise a ValueError if a file of a scene is too large, before it is decompressed and read."""
+    if name.endswith(".json") and unpacked_bytes > MAX_META_BYTES:
+        raise ValueError(f"{name} is too large")
+    check_unpacked_bytes(name, unpacked_bytes, stored_bytes)
 
 
 def sog_byte_count(path: Path) -> int:
@@ -257,12 +295,12 @@ def sog_byte_count(path: Path) -> int:
 
 def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
     """Read a file of an archive; ValueError if it is too large, before it is decompressed."""
-    if archive.getinfo(name).file_size > MAX_MEMBER_BYTES:
-        raise ValueError(f"{name} is too large")
+    record = archive.getinfo(name)
+    _check_file_size(name, record.file_size, record.compress_size)
     return archive.read(name)
 
 
-def _read_images(read_member: ReadMember, names: list[str], count: int) -> list[NDArray[np.uint8]]:
+def _read_images(files: SogFiles, names: list[str], count: int) -> list[NDArray[np.uint8]]:
     """Read images as pixels [count, 4], without the padding at their ends.
 
     Raises:
@@ -270,11 +308,9 @@ def _read_images(read_member: ReadMember, names: list[str], count: int) -> list[
     """
     images = []
     for name in names:
-        content = read_member(name)
-        with open_image(io.BytesIO(content), ("WEBP", "PNG")) as image:
+        with open_image(io.BytesIO(files.read(name)), ("WEBP", "PNG")) as image:
             pixel_count = image.width * image.height
-            if pixel_count > max(HARMLESS_PIXELS, MAX_PIXELS_PER_BYTE * len(content)):
-                raise ValueError(f"{name} claims {pixel_count:,} pixels in {len(content):,} bytes")
+            check_unpacked_bytes(name, 4 * pixel_count, files.byte_count)  # a byte a channel
             if max(image.size) > MAX_IMAGE_SIDE_PX or not 0 < count <= pixel_count:
                 size = f"{image.width}×{image.height}"
                 raise ValueError(f"{name} has {size} pixels for {count:,} Gaussians")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from spackle.formats import zstandard
 from spackle.formats.quantization import check_length_factor
 from spackle.formats.scene_content import UnsupportedSceneError
+from spackle.formats.scene_limits import check_gaussian_count
 
 MAGIC = 0x5053474E  # "NGSP", lowest byte first
 FRAMES_VERSION = 4  # the first version with Zstandard frames
@@ -34,10 +35,6 @@ EXTENSION_RECORD = struct.Struct("<II")  # kind and bytes of an extension, which
 
 MAX_COUNT = 10_000_000  # most Gaussians that older readers of the format accept
 MAX_HARMONICS_DEGREE = 4
-
-# As Niantic's library assumes, a file may hold at most so many Gaussians for each of its bytes: a
-# position alone has 9 bytes, which may be compressed to 1/1024.
-MAX_GAUSSIANS_PER_BYTE = 1024 / 9
 
 HAS_EXTENSIONS = 2  # this bit of the flags says that there are extensions
 COORDINATE_SYSTEM = 0xADBE0003  # kind of the extension that names the axes of the file
@@ -258,8 +255,7 @@ def _check_header(header: SpzHeader, file_bytes: int) -> None:
     if header.gaussian_count > MAX_COUNT:
         problem = f"{header.gaussian_count:,} Gaussians ({MAX_COUNT:,} at most)"
         raise UnsupportedSceneError(f"{problem}: split the scene, or save it as PLY")
-    if header.gaussian_count > MAX_GAUSSIANS_PER_BYTE * file_bytes:
-        raise ValueError(f"{header.gaussian_count:,} Gaussians in {file_bytes:,} bytes")
+    check_gaussian_count(header.gaussian_count, header.harmonics_degree, file_bytes)
 
 
 def _named_parts(header: SpzHeader, parts: Sequence[NDArray[np.uint8]]) -> SpzParts:
