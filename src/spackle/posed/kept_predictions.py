@@ -16,6 +16,7 @@ from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import make_folder
+from spackle.runtime.tensor_digests import tree_digest
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -33,7 +34,12 @@ class KeptPredictions:
         try:
             with safe_open(path, "pt") as file:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-                facts = json.loads(file.metadata()["facts"])
+                metadata = file.metadata()
+            facts = json.loads(metadata["facts"])
+            # A bit may have flipped. Files of older versions have no digest.
+            digest = tree_digest([tensors, facts])
+            if metadata.get("sha256", digest) != digest:
+                return None
             camera = Camera(tensors["K"], torch.eye(4), facts["width"], facts["height"])
             prediction = BasePrediction(
                 Gaussians(*(tensors[name] for name in FIELDS)),
@@ -63,7 +69,8 @@ class KeptPredictions:
             "is_metric": prediction.is_metric,
             "base": base_name,
         }
-        content = save(tensors, metadata={"facts": json.dumps(facts)})
+        metadata = {"facts": json.dumps(facts), "sha256": tree_digest([tensors, facts])}
+        content = save(tensors, metadata=metadata)
         write_atomic(self.folder / f"{key}.safetensors", content)
 
     def remove(self) -> None:

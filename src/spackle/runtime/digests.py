@@ -14,6 +14,7 @@ from spackle.runtime.files import check_file
 
 HASH_BLOCK_BYTES = 1 << 20  # read at once, so that a large file needs little memory
 MAX_HASHED_BYTES = 200_000_000  # hashing takes a second; a larger file is known by size and time
+SEAL = b"spackle sha256 "  # begins a file with a digest of all that follows the first line
 
 
 def sha256_of(file: BinaryIO) -> str:
@@ -27,6 +28,27 @@ def sha256_of(file: BinaryIO) -> str:
 def json_digest(value: object) -> str:
     """SHA-256, in hexadecimal digits, of a value as JSON; the order of keys does not matter."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def sealed(content: bytes) -> bytes:
+    """The content after a line with its SHA-256, for a file that a later run trusts."""
+    return SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n" + content
+
+
+def unsealed(data: bytes) -> bytes:
+    """The content that `sealed` was given; data without a seal, of older versions, as it is.
+
+    Raises:
+        ValueError: the content is not the one that was sealed.
+    """
+    # Of a damaged seal at least one of the three parts of its first line is left.
+    line, _, content = data.partition(b"\n")
+    seal_bytes = len(SEAL) + 2 * hashlib.sha256().digest_size
+    if not line.startswith(SEAL[:7]) and len(line) != seal_bytes:
+        return data
+    if line != sealed(content).partition(b"\n")[0]:
+        raise ValueError("its digest is another one")
+    return content
 
 
 def file_fingerprint(file: Path, kind: str) -> str:

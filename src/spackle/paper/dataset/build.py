@@ -27,7 +27,13 @@ from spackle.paper.dataset.encoding import decode_gaussians, encode_gaussians
 from spackle.paper.dataset.options import DatasetOptions, completion_facts, dataset_configuration
 from spackle.paper.dataset.photos import PhotoFile, choose_photos
 from spackle.paper.dataset.sample import pack_sample
-from spackle.paper.dataset.shards import MANIFEST_NAME, Manifest, load_manifest, write_shard
+from spackle.paper.dataset.shards import (
+    MANIFEST_NAME,
+    PARTS_FOLDER,
+    Manifest,
+    load_manifest,
+    write_shard,
+)
 from spackle.paper.dataset.views import (
     cameras_along_path,
     complete_views,
@@ -36,15 +42,13 @@ from spackle.paper.dataset.views import (
 )
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
-from spackle.runtime.digests import config_differences
+from spackle.runtime.digests import config_differences, sealed
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import remove_half_written, write_atomic
 from spackle.runtime.folders import make_folder, results_folder
 from spackle.runtime.progress import Progress, Reporter, catch_stop_signals, pluralized
 from spackle.runtime.worker_options import WorkerOptions, check_like_command
 from spackle.runtime.workers import parallel_map
-
-PARTS_FOLDER = "parts"  # folder in the output for samples that are not in a shard yet
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
@@ -140,7 +144,7 @@ class SampleMaker:
             raise
         except InputError as error:
             return PhotoResult(photo.index, problem=str(error))
-        write_atomic(part, sample)
+        write_atomic(part, sealed(sample))
         return PhotoResult(photo.index)
 
     def _make_sample(self, file: PhotoFile) -> bytes:

@@ -20,11 +20,13 @@ from spackle.formats.png import contact_sheet
 from spackle.paper.dataset.joined import JoinedDataset
 from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
 from spackle.paper.dataset.shards import (
+    PARTS_FOLDER,
     DatasetFiles,
     Manifest,
     ShardEntry,
     load_manifest,
     open_dataset_file,
+    read_part,
 )
 from spackle.runtime.errors import InputError, as_input_error, printable_line
 from spackle.runtime.folders import results_folder
@@ -108,6 +110,7 @@ def find_problems(
     """
     if not manifest.complete:
         yield "the dataset is not finished: run the same `spackle dataset build` again"
+        yield from find_part_problems(Path(location))
     checked_bytes = 0
     for shard in manifest.shards:
         try:
@@ -118,6 +121,18 @@ def find_problems(
         # A missing shard counts, too, so that the progress ends at 100 %.
         checked_bytes += shard.size
         progress(checked_bytes, manifest.size)
+
+
+def find_part_problems(folder: Path) -> Iterator[str]:
+    """Yield a line for each damaged part, the sample of a photo that waits for its shard.
+
+    Only a folder has parts; a dataset at a URL has none.
+    """
+    for path in sorted(folder.glob(f"{PARTS_FOLDER}/*.tar")):
+        try:
+            read_part(path)
+        except (InputError, OSError) as error:
+            yield str(error)
 
 
 def find_shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iterator[str]:

@@ -16,12 +16,14 @@ from pydantic import BaseModel, Field, model_validator
 from torch.utils.data import Dataset
 
 from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
-from spackle.runtime.digests import json_digest
+from spackle.runtime.digests import json_digest, unsealed
 from spackle.runtime.errors import InputError, as_input_error, reason_in_a_line
 from spackle.runtime.files import atomic_path
 
 MANIFEST_NAME = "manifest.json"
+PARTS_FOLDER = "parts"  # folder in a dataset for samples that are not in a shard yet
 FORMAT_VERSION = 1  # version of shards and manifest; other versions are refused
+DELETE_PART = "delete this file, and the same command makes it again"
 ByteCount = Annotated[int, Field(ge=0, le=1 << 40)]  # at most a terabyte
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -169,7 +171,7 @@ def write_shard(
     """Write samples to a tar file, whole or not at all; returns its entry in the manifest.
 
     Args:
-        parts: key and file of each sample; the files hold the bytes of `pack_sample`.
+        parts: key and file of each sample; the files hold the bytes of `pack_sample`, sealed.
         target: the tar file.
         passed_over: messages about photos without a sample, for the manifest.
 
@@ -181,14 +183,12 @@ def write_shard(
     size = 0
     with atomic_path(target) as temporary, open(temporary, "wb") as file:
         for key, path in parts:
-            data = path.read_bytes()
             # Each part is checked now, because a damaged one would make the whole shard useless.
+            data = read_part(path)
             try:
                 group = PhotoGroup.from_tar(key, data, str(path))
             except InputError as error:
-                raise InputError(
-                    f"{error}: delete this file, and the same command makes it again"
-                ) from error
+                raise InputError(f"{error}: {DELETE_PART}") from error
             sample = SampleEntry(
                 key=key,
                 photo=group.facts["photo"]["name"],
@@ -211,6 +211,15 @@ def write_shard(
         samples=tuple(samples),
         passed_over=tuple(passed_over),
     )
+
+
+def read_part(path: Path) -> bytes:
+    """The sample in the file of a part, as `pack_sample` has made it.
+
+    InputError if its digest shows damage; parts of older versions have no digest.
+    """
+    with as_input_error(path, f"damaged: {{reason}}: {DELETE_PART}", ValueError):
+        return unsealed(path.read_bytes())
 
 
 class DatasetFiles(Dataset[PhotoGroup]):

@@ -17,12 +17,14 @@ from spackle.paper.training.recipe import AnyRecipe, changed_keys
 from spackle.paper.training.run_logs import LOGS_FOLDER, METRICS_FILE
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path
+from spackle.runtime.tensor_digests import tree_digest
 
 CHECKPOINT_FILE = "checkpoint.pt"
 BEST_WEIGHTS = "best.safetensors"  # the averaged weights of the best validation
 LAST_WEIGHTS = "last.safetensors"  # the averaged weights of the last save
 RUN_REPORT = "run.json"
 RUN_FILES = (CHECKPOINT_FILE, BEST_WEIGHTS, LAST_WEIGHTS, RUN_REPORT, METRICS_FILE)
+DIGEST_KEY = "sha256"  # of a checkpoint's digest, beside the fields of `Checkpoint`
 PICTURES_FOLDER = "pictures"  # one picture a validation
 Log = Callable[[str], None]  # prints a line
 
@@ -86,11 +88,12 @@ class Checkpoint:
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
-    """Write checkpoint.pt, whole or not at all.
+    """Write checkpoint.pt, whole or not at all, with a digest of its content.
 
     If the disk is full, InputError, and the previous checkpoint stays.
     """
     state = {**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}
+    state[DIGEST_KEY] = tree_digest(state)
 
     # torch.save to a file would hide that the disk is full, so the bytes are made in memory.
     buffer = io.BytesIO()
@@ -99,13 +102,23 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
         temporary.write_bytes(buffer.getbuffer())
 
 
-def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """The checkpoint in a folder; None if there is none, InputError if it cannot be read."""
+def load_checkpoint(folder: Path, log: Log | None = None) -> Checkpoint | None:
+    """The checkpoint in a folder; None if there is none, InputError if it cannot be read.
+
+    `log` receives a line about a checkpoint of an older version, in which damage cannot be noticed.
+    """
     path = folder / CHECKPOINT_FILE
     if not path.exists():
         return None
     with as_input_error(path, "cannot be read ({reason}): `overwrite` starts a new run"):
         state = torch.load(path, map_location="cpu", weights_only=True)
+        # One flipped bit would silently train on with other weights.
+        digest = state.pop(DIGEST_KEY, None)
+        if digest is None:
+            if log is not None:
+                log(f"{path}: of an older version, without a digest that would show damage")
+        elif digest != tree_digest(state):
+            raise ValueError("damaged: its digest is another one")
         progress = TrainingProgress(**state.pop("progress"))
         return Checkpoint(progress=progress, **state)
 
@@ -126,7 +139,7 @@ def find_checkpoint(
         InputError: the checkpoint belongs to a run of another method, with other settings or other
             samples.
     """
-    checkpoint = load_checkpoint(output)
+    checkpoint = load_checkpoint(output, log)
     if checkpoint is None:
         return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from spackle.paper.training.ranks import rank, rank_count, wait_for_ranks
 from spackle.paper.training.recipe import DataRecipe
-from spackle.paper.training.samples import Sample, random_crops, save_sample
+from spackle.paper.training.samples import Sample, random_crops, sample_digest, save_sample
 from spackle.residual.features import CELL
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
@@ -88,6 +89,7 @@ def make_samples(
     planned_views = _plan_views(sources, seed, views)
 
     # Each process makes a range of neighbouring views, because neighbours share a photo.
+    _warn_of_old_files(folder, warn)
     first = views * rank() // rank_count()
     stop = views * (rank() + 1) // rank_count()
     for index in range(first, stop):
@@ -101,7 +103,7 @@ def make_samples(
             for number, crop in enumerate(crops):
                 save_sample(crop, _crop_file(folder, index, number))
             # Written after all crops, so that its presence proves that they are complete.
-            write_atomic(_count_file(folder, index), f"{len(crops)}\n".encode())
+            write_atomic(_count_file(folder, index), _count_line(len(crops)).encode())
         progress(index - first + 1, stop - first)
     wait_for_ranks()
 
@@ -113,6 +115,17 @@ def make_samples(
             "for holes"
         )
     return files
+
+
+def _warn_of_old_files(folder: Path, warn: Callable[[str], None]) -> None:
+    """Warn if a folder has samples of an older version, in which damage cannot be noticed."""
+    first_file = min(folder.glob("*-0.safetensors"), default=None)
+    if first_file is None or rank() != 0:
+        return
+    # A damaged file is reported when it is read.
+    with contextlib.suppress(Exception):
+        if sample_digest(first_file) is None:
+            warn(f"{folder}: samples of an older version, without digests that would show damage")
 
 
 class _PlannedView(NamedTuple):
@@ -174,12 +187,21 @@ def _count_file(folder: Path, index: int) -> Path:
     return folder / f"{index:06d}.done"
 
 
+def _count_line(count: int) -> str:
+    """The content of the file that holds the number of a view's crops: number and digest."""
+    return f"{count} {short_digest(count)}\n"
+
+
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
     """The files of a view's crops, perhaps none; None if the crops are not complete."""
     # The file with the number of crops is written last, so that it is missing after a killed run.
     try:
-        count = int(_count_file(folder, index).read_text())
-    except (FileNotFoundError, ValueError):
+        line = _count_file(folder, index).read_text()
+        count = int(line.split()[0])
+    except (FileNotFoundError, ValueError, IndexError):
+        return None
+    # A damaged number would leave crops out; older files have the number alone.
+    if line not in (_count_line(count), f"{count}\n"):
         return None
     files = [_crop_file(folder, index, number) for number in range(count)]
     return files if all(file.is_file() for file in files) else None

@@ -14,7 +14,8 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -28,8 +29,10 @@ from spackle.residual.features import CELL, ViewFeatures, cell_centers, hole_mas
 from spackle.residual.initializer import InitialGaussians
 from spackle.runtime.errors import as_input_error
 from spackle.runtime.files import write_atomic
+from spackle.runtime.tensor_digests import tree_digest
 from spackle.scene_fill.view_completion import FarRim, SceneViewCompletion
 
+DIGEST_KEY = "sha256"  # of the digest in the metadata of a sample's file
 HOLE_REACH_PX = 16  # aux Gaussians, which fill a hole, reach at most so many pixels beyond the hole
 # The names of a sample's tensors in its file, and their places in a `Sample`. Two prefixes are
 # older than the present names of the fields.
@@ -338,7 +341,8 @@ def save_sample(sample: Sample, path: Path) -> None:
     for name, tensor in tensors.items():
         if tensor.dtype == torch.float32 and name not in FLOAT32_TENSORS:
             tensors[name] = tensor.half()
-    write_atomic(path, save({name: tensor.contiguous() for name, tensor in tensors.items()}))
+    tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    write_atomic(path, save(tensors, metadata={DIGEST_KEY: tree_digest(tensors)}))
 
 
 def load_sample(path: str | os.PathLike[str]) -> Sample:
@@ -346,7 +350,13 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
     with as_input_error(
         path, "not a training sample, or damaged: delete the file; the next run makes it again"
     ):
-        tensors = {name: _to_float(name, tensor) for name, tensor in load_file(path).items()}
+        with safe_open(path, framework="pt") as file:
+            stored_tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        # Files of older versions have no digest.
+        digest = sample_digest(path)
+        if digest is not None and digest != tree_digest(stored_tensors):
+            raise ValueError("its digest is another one")
+        tensors = {name: _to_float(name, tensor) for name, tensor in stored_tensors.items()}
         tensors["base.colors"] = srgb_to_linear(tensors["base.colors"])
         width, height = tensors["camera.size"].tolist()
         camera = Camera(
@@ -371,6 +381,17 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
             surroundings=HoleSurroundings(**fields["surroundings"]),
             target=tensors["target"],
         )
+
+
+def sample_digest(path: str | os.PathLike[str]) -> str | None:
+    """The digest of its tensors that a sample's file states; None if it states none.
+
+    Raises:
+        Exception: the file is missing or broken.
+    """
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    return None if metadata is None else metadata.get(DIGEST_KEY)
 
 
 def _to_float(name: str, tensor: Tensor) -> Tensor:
