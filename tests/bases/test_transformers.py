@@ -276,6 +276,38 @@ def test_a_broken_folder_is_refused_in_one_line(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(
+    ("model", "settings", "words"),
+    [
+        ("metric", {"backbone_config": None, "backbone": "a/b"}, "names another model, 'a/b'"),
+        ("metric", {"backbone_config": {"backbone": "resnet50"}}, "another model, 'resnet50'"),
+        ("metric", {"backbone_config": {"num_hidden_layers": 10**7}}, "10000000 for 'num_hidden"),
+        ("metric", {"num_hidden_layers": 60_000}, r"60,0\d\d layers, at most 1,000"),
+        ("glpn", {"depths": [10**7]}, "the value 10000000 for 'depths'"),
+        ("glpn", {"depths": [1] * 100_000}, "100,000 values for 'depths'"),
+        ("metric", {"fusion_hidden_size": 30_000}, "bytes of weights, and its files have"),
+    ],
+)
+def test_a_configuration_asks_for_no_other_model_and_no_more_than_its_files_hold(
+    model: str,
+    settings: dict[str, Any],
+    words: str,
+    folders: Folders,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder = shutil.copytree(folders[model], tmp_path / "model")
+    change(folder, CONFIG, settings)
+
+    def ask_hub(*arguments: object, **options: object) -> None:
+        raise AssertionError("the hub was asked")
+
+    monkeypatch.setattr("huggingface_hub.HfApi.repo_exists", ask_hub)
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", ask_hub)
+    with pytest.raises(InputError, match=words):
+        load(folder)
+
+
 def test_weights_that_a_model_never_uses_may_be_missing(
     folders: Folders, tmp_path: Path, maps: list[DepthMap]
 ) -> None:

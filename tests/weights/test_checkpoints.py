@@ -262,3 +262,23 @@ def test_a_filled_network_is_frozen_and_shares_no_memory_with_its_file(
     network = load_strict(Small(), read(path), path, "give another")
     assert torch.equal(network.linear.weight, GOOD["linear.weight"])
     assert network.linear.weight.dtype == torch.float32
+
+
+def test_an_old_file_whose_pickle_asks_for_more_memory_than_the_file_has_is_refused(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "old.pt"
+    write_old({"a": torch.zeros(50_000)}, path)
+    content = path.read_bytes()
+    # The number of a storage's floats, as the pickle writes it: BININT and four bytes.
+    count = b"J" + (50_000).to_bytes(4, "little")
+    other = b"M" + (50_000).to_bytes(2, "little")  # BININT2, for numbers of two bytes
+    assert content.count(count) + content.count(other) >= 1
+    huge = b"J" + (2**31 - 1).to_bytes(4, "little")
+    path.write_bytes(content.replace(count, huge).replace(other, huge))
+    tracemalloc.start()
+    line = refusal(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "its tensors take 8,589,934,588 bytes, and the file has 2" in line
+    assert peak < 10_000_000

@@ -21,6 +21,7 @@ from torch.nn.functional import interpolate
 
 from spackle.bases import BasePrediction, is_plausible_focal
 from spackle.bases.depth import lift_predicted_depth
+from spackle.bases.model_limits import check_settings, check_weight_size
 from spackle.core.camera import Camera
 from spackle.core.photo import Photo, resize_photo
 from spackle.depth.depth_map import DepthMap, is_valid_depth
@@ -343,6 +344,12 @@ def _load_model(
     file_options = {"local_files_only": not from_hub, "trust_remote_code": False}
     settings, _ = transformers.PretrainedConfig.get_config_dict(source, **file_options)
     meaning = meaning_of(settings, name)  # before gigabytes of weights are loaded
+    check_settings(settings)
+    if os.path.isdir(source):
+        config = transformers.AutoConfig.from_pretrained(source, **file_options)
+        with torch.device("meta"):
+            empty_network = transformers.AutoModelForDepthEstimation.from_config(config)
+        check_weight_size(empty_network, Path(source))
     kind = str(settings["model_type"])
     # Only Depth Pro's image processor needs torchvision: Spackle does its work instead.
     if kind == "depth_pro":

@@ -17,13 +17,16 @@ import os
 import pickle
 import struct
 import zipfile
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
 
 # The pickle of a network with a thousand tensors has a tenth of this size.
 MAX_PICKLE_BYTES = 4_000_000
+
+# PyTorch before version 1.6 wrote three pickles before that of the tree.
+OLD_PICKLES_BEFORE_TREE = 3
 
 # Bounds for the tree of objects; an object counts each time that it is met.
 MAX_TREE_NODES = 100_000
@@ -153,7 +156,54 @@ class _StandIn:
 
 
 # The unpickler in Python; the one in C would allocate any amount of memory that a pickle asks for.
-class _InertUnpickler(pickle._Unpickler):
+class _PlainUnpickler(pickle._Unpickler):
+    """Reads a pickle as plain values and stand-ins."""
+
+    def find_class(self, module: str, name: str) -> type[_StandIn]:
+        """Return a stand-in for a class or function that the pickle names."""
+        return type("_StandIn", (_StandIn,), {"replaced_name": f"{module} {name}"})
+
+
+class _StorageCounter(_PlainUnpickler):
+    """Reads a pickle of PyTorch before version 1.6, and only counts what its tensors take."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        """Read from an open file."""
+        super().__init__(file)
+        self.bytes_of_storages: dict[object, int] = {}  # by the key of each storage
+
+    def persistent_load(self, pid: Any) -> None:
+        """Note how many bytes a storage takes, to which the pickle refers.
+
+        `pid` has as its second value the storage's class, as the third its key, and as the fifth
+        how many numbers it has.
+        """
+        _, storage_class, key, _, count, *_ = pid
+        dtype = STORAGE_DTYPES.get(storage_class.replaced_name, torch.uint8)
+        self.bytes_of_storages[key] = int(count) * dtype.itemsize
+
+
+def check_old_storages(file: BinaryIO, file_bytes: int) -> None:
+    """Raise a ValueError if tensors of an old file take more memory than the file has bytes.
+
+    PyTorch takes as much memory as the pickle asks for before it reads the numbers.
+
+    Args:
+        file: begins with the pickles of the format: its magic number, its version, facts about the
+            system, and the tree of objects.
+        file_bytes: size of the whole file.
+    """
+    for _ in range(OLD_PICKLES_BEFORE_TREE):
+        _PlainUnpickler(file).load()
+    counter = _StorageCounter(file)
+    counter.load()
+    storage_bytes = sum(counter.bytes_of_storages.values())
+    if storage_bytes > file_bytes:
+        problem = f"its tensors take {storage_bytes:,} bytes, and the file has {file_bytes:,}"
+        raise ValueError(f"{problem}: it is damaged or cut off")
+
+
+class _InertUnpickler(_PlainUnpickler):
     """Reads a pickle as plain values, stand-ins and tensors."""
 
     def __init__(
@@ -179,10 +229,6 @@ class _InertUnpickler(pickle._Unpickler):
         self._mapped_file = torch.UntypedStorage.from_file(
             os.fspath(path), shared=False, nbytes=os.path.getsize(path)
         )
-
-    def find_class(self, module: str, name: str) -> type[_StandIn]:
-        """Return a stand-in for a class or function that the pickle names."""
-        return type("_StandIn", (_StandIn,), {"replaced_name": f"{module} {name}"})
 
     def persistent_load(self, pid: Any) -> Tensor | None:
         """Return the numbers of a storage, to which the pickle refers, as a flat tensor.

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error, printable_line
 from spackle.runtime.files import check_file
-from spackle.weights.archives import read_archive, tensors_in_tree
+from spackle.weights.archives import check_old_storages, read_archive, tensors_in_tree
 
 Network = TypeVar("Network", bound=nn.Module)
 StrPath = str | os.PathLike[str]
@@ -272,8 +272,10 @@ def _read_old_pickle(path: StrPath) -> dict[str, Tensor]:
     """Return the tensors of a dict that PyTorch before version 1.6 saved, which is a bare pickle.
 
     Raises:
-        ValueError: the pickle holds more than tensors and plain values.
+        ValueError: the pickle holds more than tensors and plain values, or its tensors are larger
+            than the file.
     """
+    other_content = "a bare pickle with more than tensors; nothing in the pickle was run"
     try:
         # PyTorch asks for as many bytes as a length in the pickle says, which may be far too large
         # in a damaged file. A file object would allocate that many before it reads; a mapped file
@@ -283,10 +285,11 @@ def _read_old_pickle(path: StrPath) -> dict[str, Tensor]:
             warnings.simplefilter("ignore")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
                 readable = cast(BinaryIO, mapped)
+                check_old_storages(readable, len(mapped))
+                readable.seek(0)
                 content = torch.load(readable, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        problem = "a bare pickle with more than tensors; nothing in the pickle was run"
-        raise ValueError(problem) from error
+    except (pickle.UnpicklingError, EOFError) as error:
+        raise ValueError(other_content) from error
 
     tensors = {}
     for name, value in content.items():
