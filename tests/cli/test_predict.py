@@ -323,7 +323,7 @@ def test_a_disk_that_fails_for_one_photo_stops_nothing_else(
         "error: not enough memory to complete b.png: give a smaller photo, or close other programs",
     ]
     assert (result.code, result.lines[-1]) == (1, "2 of 3 photos failed")
-    assert names_in(tmp_path / "out") == {"c"}
+    assert names_in(tmp_path / "out") == {"c", "results.jsonl"}
     assert [json.loads(line).get("error") is None for line in result.out.splitlines()] == [
         False,
         False,
