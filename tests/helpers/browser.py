@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,12 +29,16 @@ class Opened:
     asked: list[str]
 
 
-def opened(browser: Any, url: str, **screen: Any) -> Opened:
-    """A page at an address; `screen` may have its viewport, and whether it is a phone's."""
+def opened(browser: Any, url: str, script: Path | None = None, **screen: Any) -> Opened:
+    """A page at an address, before whose own scripts a `script` runs; `screen` may have its
+    viewport, and whether it is a phone's.
+    """
     usual = {"viewport": {"width": 740, "height": 490}, "reduced_motion": "reduce"}
     context = browser.new_context(**{**usual, **screen})
     page = context.new_page()
     page.set_default_timeout(300_000)  # ms; software draws slowly on a busy machine
+    if script is not None:
+        page.add_init_script(path=script)
     found = Opened(page, [], [])
     page.on("console", lambda message: found.said.append(message.text))
     page.on("pageerror", lambda error: found.said.append(str(error)))

@@ -43,7 +43,8 @@ function corner() {
   button.onclick = () => open(!document.body.classList.contains("tools"));
   addEventListener("keydown", ({ key }) => key === "Escape" && open(false));
   open(false);
-  document.body.append(button);
+  // Who has a headset shall see it without looking for it.
+  document.body.append(document.getElementById("vr"), button);
 }
 
 /** A tap lets the picture move or stand, and a second one soon after it shows the photo's own view. */

@@ -9,6 +9,7 @@ import { sharing } from "./share.js";
 import * as source from "./source.js";
 import { KINDS, Viewer } from "./viewer.js";
 import { eyeOnPath, lookingAxes } from "./views.js";
+import { offerVr } from "./vr.js";
 
 // What is said of a stage of the work; of all others nothing but that there is work.
 const STAGES = {
@@ -33,6 +34,7 @@ if (viewer) {
   panel(viewer, say);
   divider(viewer);
   sharing(viewer, say);
+  offerVr(viewer, element("vr"), say);
   queue = new Queue(element("queue"), { work, ended, pick, stop, shows, resized: () => fit(viewer) });
   edits = new Edits(viewer, { say, progress, begin: (id) => (editing = id), end, swapped });
   uploads();

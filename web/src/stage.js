@@ -42,7 +42,9 @@ const VERTEX = "out vec2 at; void main() { at = uv; gl_Position = vec4(position.
 export class Stage {
   /** @param {HTMLCanvasElement} canvas @param {() => void} onDirty called when something better can be drawn */
   constructor(canvas, onDirty) {
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: false, depth: false, stencil: false });
+    // Nothing here needs a depth buffer but three.js, which makes no picture for a headset without one.
+    const depth = Boolean(navigator.xr);
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: false, depth, stencil: false });
     this.renderer.autoClear = false;
     this.camera = new THREE.PerspectiveCamera();
     this.camera.matrixAutoUpdate = false;
@@ -126,6 +128,7 @@ export class Stage {
   }
 
   resize(width, height) {
+    if (this.renderer.xr.isPresenting) return; // the canvas has the headset's size
     this.renderer.setSize(width, height, false);
   }
 
@@ -170,22 +173,41 @@ export class Stage {
   }
 
   drawTo(target, width, height) {
+    const { xr } = this.renderer;
     this.lens();
     this.pose();
+    const enabled = xr.enabled;
+    xr.enabled = false; // the page's eye, also while a headset shows the scene
+    this.compose(target, width, height, this.split);
+    xr.enabled = enabled;
+  }
+
+  /** Draw what the eyes of a headset see into its picture, in which they stand side by side. */
+  drawEyes() {
+    const target = this.renderer.getRenderTarget();
+    this.compose(target, target.width, target.height, null); // a divider would part the eyes
+  }
+
+  /** Draw the layers that are shown, blended in linear RGB, and bring them to a target; left of `split` the base alone. */
+  compose(target, width, height, split) {
     const [whole, bare] = this.targets;
-    const split = this.split ?? 0;
-    const column = Math.round(split * width);
+    const share = split ?? 0;
+    const column = Math.round(share * width);
     // Only what is looked at is drawn: left of the divider the base, right of it everything.
-    if (split < 1) this.drawLayers(whole, this.split === null ? this.layers : "both", width, height, column, width);
-    if (split > 0 || this.heat) this.drawLayers(bare, "base", width, height, 0, this.heat ? width : column);
+    if (share < 1) this.drawLayers(whole, split === null ? this.layers : "both", width, height, column, width);
+    if (share > 0 || this.heat) this.drawLayers(bare, "base", width, height, 0, this.heat ? width : column);
     const { uniforms } = this.sheet.material;
     uniforms.picture.value = whole.texture;
     uniforms.base.value = bare.texture;
     uniforms.split.value = column / width;
     uniforms.heat.value = this.heat;
+    const { xr } = this.renderer;
+    const enabled = xr.enabled;
+    xr.enabled = false; // one sheet over all eyes
     this.renderer.setRenderTarget(target);
     this.renderer.render(this.flat, this.camera);
     this.renderer.setRenderTarget(null);
+    xr.enabled = enabled;
   }
 
   drawLayers(target, layers, width, height, from, to) {
@@ -197,6 +219,12 @@ export class Stage {
     this.renderer.setClearColor(0x000000, 0);
     this.renderer.clear();
     this.renderer.render(this.scene, this.camera);
+  }
+
+  /** Whether the Gaussians are being brought into another order, or will be soon. */
+  get sorting() {
+    const { sorting, sortDirty, updateTimeoutId } = this.spark;
+    return sorting || sortDirty || updateTimeoutId !== -1; // in VR Spark waits for the frame's end
   }
 
   /** Resolves when the Gaussians are in order for this eye and drawn so. */
@@ -211,8 +239,8 @@ export class Stage {
     while (this.again) {
       this.again = false;
       this.draw();
-      while (this.spark.sorting || this.spark.sortDirty) {
-        this.again = true;
+      while (this.sorting) {
+        this.again = !this.renderer.xr.isPresenting; // a head is never still
         await pause(4);
       }
     }

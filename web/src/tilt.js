@@ -24,7 +24,7 @@ function follow(viewer) {
   viewer.canvas.addEventListener("pointerdown", () => (middle = null)); // the hand on the picture comes first
   addEventListener("deviceorientation", (event) => {
     const turned = turn(event);
-    if (!turned || !viewer.description || viewer.canvas.classList.contains("held")) return;
+    if (!turned || !viewer.description || viewer.inVr || viewer.canvas.classList.contains("held")) return;
     const now = event.timeStamp / 1000;
     const seconds = last ? Math.min(Math.max(now - last.at, 0), 0.25) : 0;
     const jumped = last && Math.hypot(turned[0] - last.turned[0], turned[1] - last.turned[1]) > JUMP;

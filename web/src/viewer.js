@@ -20,6 +20,7 @@ export class Viewer extends EventTarget {
     this.disparity = USUAL;
     this.onPath = true; // false where a hand holds the eye
     this.playing = false;
+    this.inVr = false; // a headset shows the scene
     this.clock = null; // how much of a turn is gone, 0..1
     this.glide = { from: [0, 0, 0], left: 0 };
     this.glideSeconds = GLIDE_S;

@@ -44,6 +44,28 @@ export function pulledTo(description, at) {
   return at.map((value) => (value * pulled) / far);
 }
 
+const NEAREST_M = 1; // metres to the nearest thing in VR, where nobody knows the scene's size
+const LEAST_RANGE_M = 0.1; // metres to each side: half the distance of two eyes, and as much again to move them
+
+/** How many metres in VR a length of 1 on the page is: the scene's own size, where it has one and both eyes have room. */
+export function metresPerUnit({ orbit, isMetric, lengthFactor = 1, zNear }) {
+  const ownSize = isMetric ? 1 / lengthFactor : NEAREST_M / zNear;
+  return Math.max(ownSize, LEAST_RANGE_M / (orbit.limit * orbit.unit));
+}
+
+/**
+ * Where a head may be that has moved [right, down, forward] from the photo's eye, so that eyes `apart` from it look
+ * from where the scene was filled: to the sides as far as a hand may pull, forward as far as a path goes, never back.
+ */
+export function headHeld({ orbit, paths }, [right, down, forward], apart) {
+  const reach = Math.max(0, orbit.limit * orbit.unit - apart);
+  const far = Math.hypot(right, down);
+  const share = far > reach ? reach / far : 1;
+  const { still, moving } = paths["rotate-forward"];
+  const most = Math.max(...still.map((place, k) => place[2] + orbit.limit * moving[k][2]));
+  return [right * share, down * share, Math.min(Math.max(forward, 0), most)];
+}
+
 function unit(vector) {
   const length = Math.hypot(...vector);
   return vector.map((value) => value / length);
