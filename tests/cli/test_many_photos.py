@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.command import Run, names_in, run
+from helpers.command import Run, names_in, report_of, run
 from helpers.flat_base import QUICK, write_small_photos
+from helpers.photos import metres, write_depth
 
 import spackle.results.many_photos as many_photos
 from spackle.results.results_file import RESULTS_NAME
@@ -72,3 +73,40 @@ def test_one_photo_that_is_named_has_no_list(tmp_path: Path) -> None:
     photos = write_small_photos(tmp_path, "a.png")
     assert predict(photos / "a.png", tmp_path / "out").code == 0
     assert names_in(tmp_path / "out") == {"a"}
+
+
+def test_a_tree_and_a_list_are_predicted_with_the_depth_and_lens_that_the_list_states(
+    tmp_path: Path,
+) -> None:
+    photos = write_small_photos(tmp_path / "photos", "a/x.png", "a_x.png", "a/x.jpg")
+    out = tmp_path / "out"
+    assert predict(photos, out, "--recursive").code == 0
+    assert [line["name"] for line in results_of(out)] == ["a/x.jpg", "a/x.png", "a_x"]
+    assert names_in(out) == {"a", "a_x", RESULTS_NAME}
+    assert names_in(out / "a" / "x.png") == {"scene.ply", "report.json"}
+
+    # The third line's depth is that of no photo, which is an error of this photo alone.
+    write_depth(photos / "depth.npy", metres(48, 36))
+    lines = [
+        {"file_name": "a/x.png", "depth_file_name": "depth.npy", "fov": 90},
+        {"file_name": "a_x.png"},
+        {"file_name": "a/x.jpg", "depth_file_name": "missing.npy"},
+    ]
+    (photos / "photos.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    listed = tmp_path / "listed"
+    options = ("--fill", "none", "--no-render", "--threads", 1)
+    result = run("predict", photos / "photos.jsonl", "-o", listed, *options)
+    assert (result.code, result.lines[-1]) == (1, "1 of 3 photos failed"), result.err
+    with_depth = report_of(listed / "a" / "x.png")
+    assert with_depth["base"]["name"] == "rgbd"
+    assert with_depth["focal_px"] == pytest.approx(24, rel=1e-3)  # half of the width, at 90 degrees
+    assert report_of(listed / "a_x")["base"]["name"] == "lite"
+    third = results_of(listed)[2]
+    assert third["status"] == "failed"
+    assert "missing.npy: no such depth map" in third["error"]
+
+    # Another focal length in the list is another result.
+    lines[0]["fov"] = 60
+    (photos / "photos.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    again = run("predict", photos / "photos.jsonl", "-o", listed, *options)
+    assert "1 of 3 photos done already (--overwrite does them again)" in again.lines

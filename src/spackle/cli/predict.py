@@ -56,7 +56,9 @@ def predict(
     photos: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="PHOTO...", help="Photos, folders of photos, or one clip.", show_default=False
+            metavar="PHOTO...",
+            help="Photos, folders of photos, lists of photos (.txt, .jsonl), or one clip.",
+            show_default=False,
         ),
     ] = None,
     posed: Annotated[
@@ -131,6 +133,9 @@ def predict(
     focal_mm: Annotated[float | None, declared("focal_mm")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
+    recursive: Annotated[
+        bool, typer.Option("--recursive", help="Also the photos of folders below the given ones.")
+    ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Predict again even if results exist.")
     ] = False,
@@ -209,19 +214,23 @@ def predict(
     if posed is not None:
         from spackle.posed.predict import predict_posed_folder
 
-        _check_suits_posed(posed, photos, trajectory, overscan)
+        _check_suits_posed(posed, photos, trajectory, overscan, recursive)
         predict_posed_folder(posed, output, options, reporter)
         return
     if not photos:
         raise InputError("no photo: give photos, folders of photos, one clip, or --posed FOLDER")
-    failure_count = _predict_all(photos, output, options, reporter)
+    failure_count = _predict_all(photos, output, options, reporter, recursive)
     # The errors have been printed already, one for each photo.
     if failure_count:
         raise typer.Exit(1)
 
 
 def _check_suits_posed(
-    posed: Path, photos: list[Path] | None, trajectory: str | None, overscan: float | None
+    posed: Path,
+    photos: list[Path] | None,
+    trajectory: str | None,
+    overscan: float | None,
+    recursive: bool,
 ) -> None:
     """InputError for arguments that contradict a folder of photos with known cameras."""
     if photos:
@@ -229,13 +238,21 @@ def _check_suits_posed(
             f"{photos[0]}: --posed {posed} names the photos: leave one of them out, "
             "or give one folder after --posed"
         )
+    if recursive:
+        raise InputError(
+            f"--recursive: the cameras of --posed {posed} name the photos: leave it out"
+        )
     if trajectory is not None or overscan is not None:
         option = "--trajectory" if trajectory is not None else "--overscan"
         raise InputError(f"{option}: with --posed the camera goes through the photos: leave it out")
 
 
 def _predict_all(
-    sources: list[Path], output: Path, options: PredictOptions, reporter: Reporter
+    sources: list[Path],
+    output: Path,
+    options: PredictOptions,
+    reporter: Reporter,
+    recursive: bool,
 ) -> int:
     """Predict a clip, or photos and folders of photos; returns how many photos failed.
 
@@ -244,19 +261,24 @@ def _predict_all(
     # Imported here, because the help must not wait for torch.
     from spackle.clips.files import is_clip
     from spackle.clips.predict import VIDEO_FILE, clip_options, predict_clip
+    from spackle.core.photo_lists import is_photo_list
     from spackle.pipeline import Pipeline
-    from spackle.results.many_photos import find_photos, predict_photos, say_if_kernels_compile
+    from spackle.results.many_photos import predict_photos, say_if_kernels_compile
+    from spackle.results.photo_names import files_of_pattern, find_photos
     from spackle.runtime.files import check_file
     from spackle.runtime.folders import results_folder
 
     left_out: list[str] = []
-    photos = find_photos(sources, left_out.append)
-    # Of an animation in a folder of photos, the first picture is a photo like the others.
-    folders = {source for source in sources if source.is_dir()}
-    clips = [photo for photo in photos if photo.path.parent not in folders and is_clip(photo.path)]
+    photos = find_photos(sources, output, left_out.append, recursive=recursive)
+    # Of an animation in a folder or list of photos, the first picture is a photo like the others.
+    given_files: set[Path] = set()
+    for source in sources:
+        if not source.is_dir() and not is_photo_list(source):
+            given_files.update(files_of_pattern(source))
+    clips = [photo for photo in photos if photo.path in given_files and is_clip(photo.path)]
     if not clips:
         # A folder with one photo is not a single photo: the next run may find more in it.
-        is_single_photo = len(sources) == len(photos) == 1 and not sources[0].is_dir()
+        is_single_photo = len(photos) == 1 and [photos[0].path] == sources
         return predict_photos(
             photos,
             output,

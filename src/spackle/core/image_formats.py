@@ -186,6 +186,7 @@ def list_photos(
     folder: Path,
     *,
     below: bool = False,
+    without: Path | None = None,
     log: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """The sorted photos of a folder, told by their content, whatever their names end in.
@@ -194,15 +195,18 @@ def list_photos(
 
     Args:
         folder: the folder; hidden files in it are passed over.
-        below: also list the photos of the visible subfolders.
-        log: receives a line that names and counts the files that are left out.
+        below: also list the photos of the visible subfolders, but not of those that are links.
+        without: a folder that is passed over, such as that of the results.
+        log: receives a line that names and counts the files that are left out, and one for
+            subfolders that are links.
 
     Raises:
         InputError: the folder cannot be read.
     """
     photos: list[Path] = []
     left_out: list[Path] = []
-    for file in list_files(folder, ("",), below=below):
+    links: list[Path] = []
+    for file in list_files(folder, ("",), below=below, without=without, links=links):
         # A usual suffix saves opening the file, which takes long for many files on a server.
         is_photo = file.name.lower().endswith(PHOTO_SUFFIXES) or _looks_like_photo(file)
         if is_photo:
@@ -211,6 +215,12 @@ def list_photos(
             left_out.append(file)
     if left_out and log is not None:
         log(f"{folder}: {describe_left_out(left_out, folder)}")
+    if links and log is not None:
+        names = _first_names(sorted(links), folder)
+        log(
+            f"{folder}: subfolders that are links are left out, {names}: "
+            "give them as folders of their own"
+        )
     return photos
 
 
@@ -229,11 +239,16 @@ def _looks_like_photo(path: Path) -> bool:
 
 def describe_left_out(files: Sequence[Path], folder: Path) -> str:
     """A line that counts the files of a folder that are no photos, and names the first of them."""
-    names = [file.relative_to(folder).as_posix() for file in files[:MAX_LISTED_NAMES]]
     count = len(files)
-    listed = ", ".join(names)
-    if count > len(names):
-        listed += f" and {count - len(names)} more"
+    listed = _first_names(files, folder)
     if count == 1:
         return f"1 file is no photo, and is left out: {listed}"
     return f"{count} files are no photos, and are left out: {listed}"
+
+
+def _first_names(files: Sequence[Path], folder: Path) -> str:
+    """The names of the first files, relative to their folder, and the number of the others."""
+    names = [file.relative_to(folder).as_posix() for file in files[:MAX_LISTED_NAMES]]
+    listed = ", ".join(names)
+    more_count = len(files) - len(names)
+    return f"{listed} and {more_count} more" if more_count else listed

@@ -74,7 +74,12 @@ def is_photo_list(path: str | os.PathLike[str]) -> bool:
 
 
 def photos_of(
-    source: Path, *, folder: Path | None = None, recursive: bool = False, log: Log | None = None
+    source: Path,
+    *,
+    folder: Path | None = None,
+    recursive: bool = False,
+    without: Path | None = None,
+    log: Log | None = None,
 ) -> Iterator[ListedPhoto]:
     """Yield the photos of a folder, sorted by name, or those of a list, in its order.
 
@@ -85,6 +90,7 @@ def photos_of(
         source: a folder, or a file whose suffix is one of `LIST_SUFFIXES`.
         folder: where the relative paths of a list begin; None: in the list's own folder.
         recursive: also the photos of a folder's visible subfolders.
+        without: a subfolder that is passed over, such as that of the results.
         log: receives a line about files of a folder that are no photos, and one if photos that
             COCO annotations name are missing.
 
@@ -92,7 +98,7 @@ def photos_of(
         InputError: there is no photo, no such file, or a line of a list cannot be used.
     """
     if os.path.isdir(source):
-        yield from _photos_of_folder(source, recursive, log)
+        yield from _photos_of_folder(source, recursive, without, log)
         return
     if not is_photo_list(source):
         raise InputError(
@@ -111,11 +117,15 @@ def photos_of(
         yield from _photos_of_lines(source, root, _photo_of_path_line)
 
 
-def _photos_of_folder(folder: Path, recursive: bool, log: Log | None) -> Iterator[ListedPhoto]:
+def _photos_of_folder(
+    folder: Path, recursive: bool, without: Path | None, log: Log | None
+) -> Iterator[ListedPhoto]:
     """Yield the photos of a folder; InputError if there are none."""
-    files = list_photos(folder, below=recursive, log=log)
+    files = list_photos(folder, below=recursive, without=without, log=log)
     if not files:
-        raise InputError(f"{folder}: no photos in this folder: give another one")
+        has_subfolders = not recursive and any(path.is_dir() for path in folder.iterdir())
+        advice = "give `recursive` for those of its subfolders, or" if has_subfolders else "give"
+        raise InputError(f"{folder}: no photos in this folder: {advice} another one")
     # By name, that is, with slashes, so that the order is the same on every system.
     names = sorted(file.relative_to(folder).as_posix() for file in files)
     for name in names:

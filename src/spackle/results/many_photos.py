@@ -1,26 +1,23 @@
 """Predict many photos, by this process or by several, and go on where an earlier run stopped.
 
-Read `predict_photos` first; `find_photos` names the photos, and `Predictor` predicts one after the
-other.
+Read `predict_photos` first; `Predictor` predicts one photo after the other. `find_photos` in
+`photo_names.py` names them.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import glob
 import os
 import shlex
 import socket
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import spackle
-from spackle.bases.open import BaseError
-from spackle.core.image_formats import list_photos
+from spackle.bases.open import BaseError, open_base
 from spackle.depth.calibration import calibration_candidates
 from spackle.depth.readers import find_depth_file
 from spackle.depth.writers import check_depth_name
@@ -33,6 +30,7 @@ from spackle.results.photo_folder import (
     predict_photo,
     read_earlier_report,
 )
+from spackle.results.photo_names import NamedPhoto
 from spackle.results.results_file import ResultsFile
 from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
@@ -102,14 +100,6 @@ class PredictOptions:
             )
 
 
-class NamedPhoto(NamedTuple):
-    """A photo, and the name of the folder with its results."""
-
-    path: Path
-    name: str
-    number: int  # its place among the photos of the run, from 0
-
-
 class PhotoResult(NamedTuple):
     """What a worker says about a photo."""
 
@@ -128,65 +118,6 @@ def say_if_kernels_compile(pipeline: Pipeline, reporter: Reporter) -> None:
             "first use: kernels are compiled for this processor, "
             "which takes about half a minute, once"
         )
-
-
-def find_photos(
-    sources: Sequence[Path], log: Callable[[str], None] | None = None
-) -> list[NamedPhoto]:
-    """The photos that are given by name, by a pattern such as "*.png", or by folder.
-
-    The folder of a photo's results is named by the photo's file without the suffix, or with the
-    suffix if another photo has the same name without it.
-
-    Args:
-        sources: names, patterns and folders.
-        log: receives a line that names and counts the files of a folder that are no photos.
-
-    Raises:
-        InputError: a folder without photos, or two photos whose results would have the same name.
-    """
-    photos: list[Path] = []
-    for source in sources:
-        photos += _photos_of(source, log)
-
-    # Names that differ only in upper and lower case count as equal, because the file systems of
-    # Windows and macOS do not distinguish them.
-    stem_counts = Counter(photo.stem.casefold() for photo in photos)
-    named: dict[str, NamedPhoto] = {}
-    for photo in photos:
-        is_unique = stem_counts[photo.stem.casefold()] == 1
-        is_only_dots = not photo.stem.strip(".")  # "...png" has the stem "..", the folder above
-        name = photo.stem if is_unique and not is_only_dots else photo.name
-        other = named.get(name.casefold())
-        if other is not None:
-            raise InputError(
-                f"{photo}: {other.path} has the same name: "
-                "predict them in two runs, each with its own `output`"
-            )
-        named[name.casefold()] = NamedPhoto(photo, name, len(named))
-    return list(named.values())
-
-
-def _photos_of(source: Path, log: Callable[[str], None] | None) -> list[Path]:
-    """The photos in a folder, or those that match a pattern, or the file itself.
-
-    `log` receives a line about other files of the folder. InputError for a folder without photos.
-    """
-    if os.path.isdir(source):
-        photos = list_photos(source, log=log)
-        if not photos:
-            raise InputError(f"{source}: no photos in this folder: give another one")
-        return photos
-
-    # Not every shell replaces a pattern by names. If a file has just this name, such as "a[1].png",
-    # the file is meant.
-    if not os.path.lexists(source):
-        matches = sorted(glob.glob(str(source)))
-        if matches:
-            return [Path(match) for match in matches]
-
-    # Whether the file exists is checked when it is read, where the message can say more.
-    return [source]
 
 
 def predict_photos(
@@ -425,7 +356,12 @@ class Predictor:
                 facts = self._input_facts(photo)
                 request = self.request_digest(photo)
                 report = predict_photo(
-                    photo.path, folder, self.pipeline, reporter, self.options.photo, request
+                    photo.path,
+                    folder,
+                    self._pipeline_of(photo),
+                    reporter,
+                    self._options_of(photo),
+                    request,
                 )
         except InputError as error:
             # A BaseError means that the base fails for every photo. Any other error is that of one
@@ -477,6 +413,27 @@ class Predictor:
             "files": sizes,  # in bytes
             "state": None if input_facts is None else self._state_of(folder, sizes, input_facts),
         }
+
+    def _pipeline_of(self, photo: NamedPhoto) -> Pipeline:
+        """The pipeline for a photo: that of all photos, or one for the depth that a list names.
+
+        InputError if the base takes no depth map.
+        """
+        if photo.depth is None:
+            return self.pipeline
+        # The base that lifts a photo by a depth map is no network, so opening it costs nothing.
+        settings = dataclasses.replace(self.options.scene.base, depth=photo.depth)
+        return dataclasses.replace(
+            self.pipeline,
+            base=open_base(settings),
+            options=dataclasses.replace(self.pipeline.options, base=settings),
+        )
+
+    def _options_of(self, photo: NamedPhoto) -> PhotoOptions:
+        """The options of reading and writing a photo, with the focal length that a list states."""
+        if not photo.lens.stated:
+            return self.options.photo
+        return dataclasses.replace(self.options.photo, lens=photo.lens.stated)
 
     def unfinished(
         self, photos: Sequence[NamedPhoto], results_file: ResultsFile, reporter: Reporter
@@ -539,8 +496,8 @@ class Predictor:
         seconds = report["seconds"]["total"]
         return self._line_of(photo, seconds=seconds, files=files, input_facts=facts)
 
-    def _input_facts(self, photo: NamedPhoto) -> list[tuple[int, int]] | None:
-        """Size and time of last change of the photo and of what belongs to it.
+    def _input_facts(self, photo: NamedPhoto) -> list[object] | None:
+        """Size and time of last change of the photo and of what belongs to it, and its lens.
 
         None if a file cannot be looked at, which `request_digest` reports. InputError if the depth
         map is missing.
@@ -549,7 +506,7 @@ class Predictor:
             facts = [os.stat(file) for file, _ in self._input_files(photo)]
         except (OSError, ValueError):  # a ValueError is that of a name with a null character
             return None
-        return [(fact.st_size, fact.st_mtime_ns) for fact in facts]
+        return [*photo.lens, *((fact.st_size, fact.st_mtime_ns) for fact in facts)]
 
     def _state_of(
         self, folder: Path, names: Iterable[str], input_facts: Sequence[object]
@@ -581,7 +538,9 @@ class Predictor:
         """
         # A fingerprint says which content a file has.
         fingerprints = [file_fingerprint(file, kind) for file, kind in self._input_files(photo)]
-        return json_digest([self.shared_digest, *fingerprints])
+        # Without a stated focal length the digest is that of runs before lists could state one.
+        stated_lens = [photo.lens.stated] if photo.lens.stated else []
+        return json_digest([self.shared_digest, *fingerprints, *stated_lens])
 
     def _input_files(self, photo: NamedPhoto) -> Iterator[tuple[Path, str]]:
         """Yield the photo, its depth map and calibration, each with what messages call it.
@@ -589,8 +548,9 @@ class Predictor:
         InputError if a depth map is missing.
         """
         yield photo.path, "photo"
-        depth = self.options.scene.base.depth
-        if isinstance(depth, Path):  # a depth map, or a folder with a map for each photo
+        # A depth map, or a folder with a map for each photo.
+        depth = photo.depth or self.options.scene.base.depth
+        if isinstance(depth, Path):
             depth_file = find_depth_file(depth, photo.path)
             yield depth_file, "depth map"
             # The calibration beside a depth map gives its numbers their unit.

@@ -138,22 +138,38 @@ def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> N
                 file.unlink(missing_ok=True)
 
 
-def list_files(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
+def list_files(
+    folder: Path,
+    endings: tuple[str, ...],
+    *,
+    below: bool = False,
+    without: Path | None = None,
+    links: list[Path] | None = None,
+) -> list[Path]:
     """A sorted list of a folder's visible files whose names end in one of `endings`.
 
     Args:
         folder: the folder; InputError if it cannot be read.
         endings: lower-case ends of names, such as ".jpg"; upper case is found, too.
-        below: also list files of the visible subfolders.
+        below: also list files of the visible subfolders, but not of those that are links.
+        without: a folder that is passed over, such as that of the results.
+        links: receives the visible subfolders that are links.
     """
     with as_input_error(folder, "cannot read the folder: {reason}", OSError):
         os.scandir(folder).close()  # `os.walk` says nothing about a folder that it cannot read
+    passed_over = None if without is None else os.path.realpath(without)
 
     files = []
     for place, subfolders, names in os.walk(folder):
         # `os.walk` goes on with the subfolders that are left in its own list, so the list itself is
-        # changed.
+        # changed. It does not follow links, which may lead in a circle.
         subfolders[:] = [name for name in subfolders if below and not name.startswith(".")]
+        for name in list(subfolders):
+            path = Path(place) / name
+            if passed_over is not None and os.path.realpath(path) == passed_over:
+                subfolders.remove(name)
+            elif links is not None and path.is_symlink():
+                links.append(path)
         for name in names:
             file = Path(place) / name
             is_wanted = name.lower().endswith(endings) and not name.startswith(".")
