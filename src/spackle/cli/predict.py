@@ -136,6 +136,17 @@ def predict(
     recursive: Annotated[
         bool, typer.Option("--recursive", help="Also the photos of folders below the given ones.")
     ] = False,
+    tar: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=1_000_000,
+            hidden=True,
+            help="Write tars with the results of N photos each, in place of a folder for each.",
+            show_default=False,
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Predict again even if results exist.")
     ] = False,
@@ -204,7 +215,9 @@ def predict(
             keep_base=keep_base,
             depth_out=depth_out,
             keep_frame=keep_frame,
+            timeless_report=tar is not None,
         ),
+        tar=tar,
         overwrite=overwrite,
         workers=workers,
         threads=threads,
@@ -214,7 +227,8 @@ def predict(
     if posed is not None:
         from spackle.posed.predict import predict_posed_folder
 
-        _check_suits_posed(posed, photos, trajectory, overscan, recursive)
+        _check_suits_posed(posed, photos, trajectory, overscan)
+        _check_not_many(recursive, tar, "with --posed the results are one scene")
         predict_posed_folder(posed, output, options, reporter)
         return
     if not photos:
@@ -230,7 +244,6 @@ def _check_suits_posed(
     photos: list[Path] | None,
     trajectory: str | None,
     overscan: float | None,
-    recursive: bool,
 ) -> None:
     """InputError for arguments that contradict a folder of photos with known cameras."""
     if photos:
@@ -238,13 +251,16 @@ def _check_suits_posed(
             f"{photos[0]}: --posed {posed} names the photos: leave one of them out, "
             "or give one folder after --posed"
         )
-    if recursive:
-        raise InputError(
-            f"--recursive: the cameras of --posed {posed} name the photos: leave it out"
-        )
     if trajectory is not None or overscan is not None:
         option = "--trajectory" if trajectory is not None else "--overscan"
         raise InputError(f"{option}: with --posed the camera goes through the photos: leave it out")
+
+
+def _check_not_many(recursive: bool, tar: int | None, reason: str) -> None:
+    """InputError for an option that is for many photos only."""
+    if recursive or tar is not None:
+        option = "--recursive" if recursive else "--tar"
+        raise InputError(f"{option}: {reason}: leave it out")
 
 
 def _predict_all(
@@ -278,7 +294,8 @@ def _predict_all(
     clips = [photo for photo in photos if photo.path in given_files and is_clip(photo.path)]
     if not clips:
         # A folder with one photo is not a single photo: the next run may find more in it.
-        is_single_photo = len(photos) == 1 and [photos[0].path] == sources
+        is_file = len(photos) == 1 and [photos[0].path] == sources
+        is_single_photo = is_file and options.tar is None
         return predict_photos(
             photos,
             output,
@@ -293,6 +310,7 @@ def _predict_all(
     if len(sources) > 1 or len(photos) > 1:
         raise InputError(f"{clip.path}: is a clip: give it alone, without other photos or clips")
 
+    _check_not_many(recursive, options.tar, f"{clip.path} is a clip")
     # `clip_options` refuses options that a clip cannot take.
     pipeline = Pipeline.open(clip_options(options.scene, options.photo, options.workers))
     say_if_kernels_compile(pipeline, reporter)

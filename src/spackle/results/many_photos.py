@@ -6,6 +6,7 @@ Read `predict_photos` first; `Predictor` predicts one photo after the other. `fi
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -31,7 +32,8 @@ from spackle.results.photo_folder import (
     read_earlier_report,
 )
 from spackle.results.photo_names import NamedPhoto
-from spackle.results.results_file import ResultsFile
+from spackle.results.result_tars import ResultTars
+from spackle.results.results_file import RESULTS_NAME, ResultsFile
 from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
 from spackle.runtime.errors import InputError, as_input_error
@@ -66,6 +68,7 @@ class PredictOptions:
     workers: int | None = None  # processes that share the photos; None: one a GPU, or one
     threads: int | None = None  # of each worker; None: the cores, shared evenly
     ray: str | None = None  # address of a Ray cluster, whose machines predict the photos
+    tar: int | None = None  # results of so many photos become a tar; None: a folder for each photo
 
     def open_pipeline(self) -> Pipeline:
         """Open the pipeline for all photos; InputError for an option that no photo can use."""
@@ -181,7 +184,10 @@ def predict_photos(
     else:
         # Of many photos the line says NAME, which stands for the name of any of them.
         folder = output / (photos[0].name if is_single else "NAME")
-        _say_where_to_look(folder, options, reporter)
+        if options.tar is None:
+            _say_where_to_look(folder, options, reporter)
+        else:
+            reporter.log(f"Look at {output / 'results-*.tar'}, listed in {output / RESULTS_NAME}")
     return failure_count
 
 
@@ -196,8 +202,15 @@ def _predict_many(
     The caller has locked the folder of the results.
     """
     output = predictor.output
-    with ResultsFile(output, [photo.name for photo in photos]) as results_file:
-        unfinished = predictor.unfinished(photos, results_file, reporter)
+    with contextlib.ExitStack() as stack:
+        results_file = stack.enter_context(ResultsFile(output, [photo.name for photo in photos]))
+        tars = None
+        if predictor.options.tar is not None:
+            tars = stack.enter_context(ResultTars(output, photos, predictor.options.tar))
+            predictor = dataclasses.replace(predictor, output=tars.staging)
+        unfinished = predictor.unfinished(photos, results_file, tars, reporter)
+        if tars is not None:
+            tars.begin(unfinished)
         if workers.in_this_process:
             # A second process would hold torch and the base's network in memory twice.
             lines = _predict_in_this_process(predictor, unfinished, workers.threads, reporter)
@@ -206,7 +219,7 @@ def _predict_many(
             # processes.
             open_predictor = functools.partial(
                 Predictor.open,
-                output,
+                predictor.output,
                 predictor.options,
                 predictor.shared_digest,
                 reporter.verbose,
@@ -216,10 +229,21 @@ def _predict_many(
             )
         failure_count = 0
         for photo, line in lines:
-            results_file.add(photo.number, line)
+            results_file.add(photo.number, _with_tar(line, photo, tars))
             if line["status"] == FAILED:
                 failure_count += 1
+            if tars is not None:
+                tars.photo_done(photo)
     return failure_count
+
+
+def _with_tar(
+    line: Mapping[str, Any], photo: NamedPhoto, tars: ResultTars | None
+) -> Mapping[str, Any]:
+    """A photo's line with the name of the tar that its results belong to, if there are tars."""
+    if tars is None or line["status"] == FAILED:
+        return line
+    return {**line, "tar": tars.name_of(photo)}
 
 
 def _predict_in_this_process(
@@ -299,7 +323,7 @@ def _predict_by_workers(
 class Predictor:
     """Predicts one photo after the other."""
 
-    output: Path
+    output: Path  # has a folder for each photo
     options: PredictOptions
     shared_digest: str  # of what the results of all photos depend on
     is_single: bool  # one photo was named: it is always predicted, and an error ends the run
@@ -389,7 +413,7 @@ class Predictor:
         self,
         photo: NamedPhoto,
         *,
-        seconds: float,
+        seconds: float | None,
         files: Mapping[str, Mapping[str, Any]],
         input_facts: Sequence[object] | None,
     ) -> Mapping[str, Any]:
@@ -397,7 +421,7 @@ class Predictor:
 
         Args:
             photo: the photo.
-            seconds: that it took.
+            seconds: that it took; None: unknown, because a killed run completed it.
             files: the records of its files in its report.
             input_facts: what `_input_facts` returned before the work; None: predict again next
                 time.
@@ -405,13 +429,18 @@ class Predictor:
         folder = self.output / photo.name
         sizes = {name: record["bytes"] for name, record in files.items()}
         sizes[REPORT_NAME] = (folder / REPORT_NAME).stat().st_size
+        state = None
+        if input_facts is not None:
+            # Results that go into a tar are not looked at again.
+            names = sizes if self.options.tar is None else ()
+            state = self._state_of(folder, names, input_facts)
         return {
             "name": photo.name,
             "photo": str(photo.path),
             "status": OK,
-            "seconds": round(seconds, 3),
+            "seconds": None if seconds is None else round(seconds, 3),
             "files": sizes,  # in bytes
-            "state": None if input_facts is None else self._state_of(folder, sizes, input_facts),
+            "state": state,
         }
 
     def _pipeline_of(self, photo: NamedPhoto) -> Pipeline:
@@ -436,21 +465,30 @@ class Predictor:
         return dataclasses.replace(self.options.photo, lens=photo.lens.stated)
 
     def unfinished(
-        self, photos: Sequence[NamedPhoto], results_file: ResultsFile, reporter: Reporter
+        self,
+        photos: Sequence[NamedPhoto],
+        results_file: ResultsFile,
+        tars: ResultTars | None,
+        reporter: Reporter,
     ) -> list[NamedPhoto]:
         """The photos without complete results; says how many others there are.
 
-        Photos with results about which `results_file` knows nothing get a line in it.
+        Photos with results about which `results_file` knows nothing get a line in it. `tars` are
+        told which photos they hold.
         """
         unfinished = []
         for photo in photos:
             earlier_line = results_file.line_of(photo.number)
             line = self.finished_line(photo, earlier_line)
+            if tars is not None:
+                tars.check_same_place(photo, earlier_line)
+                if line is None and tars.exists(photo):
+                    line = self._finished_in_tar(photo, earlier_line, tars)
             if line is None:
                 unfinished.append(photo)
                 continue
             if line is not earlier_line:
-                results_file.add(photo.number, line)
+                results_file.add(photo.number, _with_tar(line, photo, tars))
             reporter.result({"folder": self.output / photo.name, "done_already": True})
         finished_count = len(photos) - len(unfinished)
         if finished_count:
@@ -476,8 +514,9 @@ class Predictor:
         folder = self.output / photo.name
         try:
             facts = self._input_facts(photo)
-            # Reading photo and results takes long, so sizes and times are looked at first.
-            if earlier_line and facts is not None:
+            # Reading photo and results takes long, so sizes and times are looked at first. Of
+            # photos whose results wait for a tar there are few.
+            if earlier_line and facts is not None and self.options.tar is None:
                 state = self._state_of(folder, earlier_line.get("files", {}), facts)
                 if state is not None and state == earlier_line.get("state"):
                     return earlier_line
@@ -493,8 +532,52 @@ class Predictor:
         files: Any = report.get("files")
         if not matches_records(folder, REPORT_NAME, files):
             return None
-        seconds = report["seconds"]["total"]
+        seconds = report.get("seconds", {}).get("total")
+        if earlier_line:
+            seconds = earlier_line.get("seconds", seconds)
         return self._line_of(photo, seconds=seconds, files=files, input_facts=facts)
+
+    def _finished_in_tar(
+        self, photo: NamedPhoto, earlier_line: Mapping[str, Any], tars: ResultTars
+    ) -> Mapping[str, Any] | None:
+        """The line of a photo whose tar has results of the same input and options; else None.
+
+        Args:
+            photo: the photo, whose tar exists.
+            earlier_line: what an earlier run wrote about it, if anything.
+            tars: are told that the photo's results are to be kept.
+        """
+        if self.options.overwrite:
+            return None
+        try:
+            facts = self._input_facts(photo)
+        except InputError:
+            facts = None
+        if facts is None:
+            return None  # a file is missing, which `predict` will report
+        state = self._state_of(self.output, (), facts)
+        if earlier_line.get("state") == state:
+            tars.keep(photo)
+            return earlier_line
+
+        # Without a line, as after the loss of results.jsonl, the report in the tar decides.
+        report, report_size = tars.report_of(photo)
+        try:
+            has_same_request = report.get("request") == self.request_digest(photo)
+        except InputError:
+            has_same_request = False
+        if not has_same_request:
+            return None
+        tars.keep(photo)
+        sizes = {name: record["bytes"] for name, record in report["files"].items()}
+        return {
+            "name": photo.name,
+            "photo": str(photo.path),
+            "status": OK,
+            "seconds": earlier_line.get("seconds"),
+            "files": {**sizes, REPORT_NAME: report_size},
+            "state": state,
+        }
 
     def _input_facts(self, photo: NamedPhoto) -> list[object] | None:
         """Size and time of last change of the photo and of what belongs to it, and its lens.

@@ -43,6 +43,8 @@ class PhotoOptions:
     keep_base: bool = False  # write base.ply, the Gaussians of what the photo shows
     depth_out: str | None = None  # write the photo's depth to a file of this name
     keep_frame: bool = False  # keep a uniform frame around the photo
+    # Leave the times out of report.json, whose bytes then depend on input and options alone.
+    timeless_report: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -201,7 +203,10 @@ def predict_photo(
         new_folder = folders.enter_context(atomic_files(folder, REPORT_NAME))
         video = _write_files(completed, new_folder, pipeline, reporter, options)
         report = _report_of(completed, new_folder, pipeline, reporter, video, request)
-        write_json(report.to_json(), new_folder / REPORT_NAME)
+        content = report.to_json()
+        if options.timeless_report:
+            del content["seconds"]
+        write_json(content, new_folder / REPORT_NAME)
 
     reporter.log(
         f"{path.name}: {report.aux_gaussians:,} aux Gaussians "
