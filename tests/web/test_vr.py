@@ -70,7 +70,7 @@ def page(shown: Opened) -> Iterator[Any]:
 def begin_vr(page: Any) -> None:
     """Press the button, and wait until the headset asks for a picture."""
     page.locator("#vr").click()
-    page.wait_for_function("headset.session?.waiting.size > 0")
+    page.wait_for_function("headset.session?.waiting.size > 0", timeout=60_000)  # ms
 
 
 def eyes(

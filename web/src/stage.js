@@ -238,9 +238,10 @@ export class Stage {
     await this.mesh.initialized;
     while (this.again) {
       this.again = false;
-      this.draw();
+      const { isPresenting } = this.renderer.xr;
+      if (!isPresenting) this.draw();
       while (this.sorting) {
-        this.again = !this.renderer.xr.isPresenting; // a head is never still
+        this.again = !isPresenting; // a head is never still
         await pause(4);
       }
     }

@@ -14,7 +14,7 @@ export class Viewer extends EventTarget {
   constructor(canvas) {
     super();
     this.canvas = canvas;
-    this.stage = new Stage(canvas, () => this.refresh());
+    this.stage = new Stage(canvas, () => this.inVr || this.refresh()); // in VR the headset asks for pictures
     this.kind = "rotate-forward";
     this.t = 0; // on the path, 0..1
     this.disparity = USUAL;
