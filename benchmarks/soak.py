@@ -161,7 +161,7 @@ class Client:
             answer = connection.getresponse()
             content = answer.read()
             is_json = answer.headers.get("content-type", "").startswith("application/json")
-            return answer.status, json.loads(content) if is_json else content
+            return answer.status, json.loads(content) if is_json and content else content
 
 
 class Watcher(threading.Thread):
@@ -172,14 +172,18 @@ class Watcher(threading.Thread):
         self.client = client
         self.pid = pid
         self.health_ms: list[float] = []
+        # How much later than asked this thread wakes up: what the machine itself adds.
+        self.late_ms: list[float] = []
         self.megabytes: list[float] = []
         self.should_stop = threading.Event()
 
     def run(self) -> None:
         """Measure."""
         next_memory = 0.0
+        asleep = time.perf_counter()
         while not self.should_stop.wait(PROBE_S):
             start = time.perf_counter()
+            self.late_ms.append(1000 * (start - asleep - PROBE_S))
             status, _ = self.client.ask("/healthz")
             assert status == 200
             self.health_ms.append(1000 * (time.perf_counter() - start))
@@ -187,6 +191,7 @@ class Watcher(threading.Thread):
                 next_memory = time.monotonic() + MEMORY_PROBE_S
                 pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
                 self.megabytes.append(pages * os.sysconf("SC_PAGESIZE") / 1e6)
+            asleep = time.perf_counter()
 
 
 def children_of(pid: int) -> list[int]:
@@ -307,7 +312,6 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
         ends = {id: (disk / "scenes" / id / "ends").read_text() for id in states}
         temporary = list((disk / "scenes").rglob(".*.*"))
         workers = len(children_of(server.pid))
-    health = sorted(watcher.health_ms)
     third = max(1, len(watcher.megabytes) // 3)
     return {
         "jobs sent": sent,
@@ -326,17 +330,24 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
         "disk full once": has_own_disk,
         "processes at the end": workers,
         "seconds of the slowest refusal": round(max(refused_bombs, default=0), 1),
-        "healthz, ms": {
-            "median": round(health[len(health) // 2], 1),
-            "p99": round(health[int(0.99 * (len(health) - 1))], 1),
-            "longest": round(health[-1], 1),
-            "asked": len(health),
-        },
+        "healthz, ms": summary(watcher.health_ms),
+        "a thread of the client wakes up late by, ms": summary(watcher.late_ms),
         "server, MB": {
             "first third": round(sum(watcher.megabytes[:third]) / third),
             "last third": round(sum(watcher.megabytes[-third:]) / third),
             "most": round(max(watcher.megabytes)),
         },
+    }
+
+
+def summary(values: list[float]) -> dict[str, float]:
+    """The middle and the end of a list of numbers."""
+    values = sorted(values)
+    return {
+        "median": round(values[len(values) // 2], 1),
+        "p99": round(values[int(0.99 * (len(values) - 1))], 1),
+        "longest": round(values[-1], 1),
+        "count": len(values),
     }
 
 

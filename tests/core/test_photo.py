@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.photo_files import jpeg, jpeg_of_scans
 from PIL import Image, ImageCms, ImageOps, TiffImagePlugin
 
 from spackle.core.focal_length import FocalSource, focal_from_exif, focal_mm_to_px
+from spackle.core.image_files import count_scans
 from spackle.core.photo import load_photo, replace_border, resize_photo, working_size
 from spackle.runtime.errors import InputError
 
@@ -218,3 +220,23 @@ def test_bad_files(tmp_path: Path, content: bytes | None, says: str) -> None:
     with pytest.raises(InputError, match=says) as caught:
         load_photo(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_jpeg_of_thousands_of_scans_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    path = tmp_path / "scans.jpg"
+    path.write_bytes(jpeg_of_scans(20_000))
+    with pytest.raises(InputError, match=r"scans\.jpg: cannot be decoded \(it has 20\d{3} scans"):
+        load_photo(path)
+
+
+def test_the_scans_of_a_jpeg_are_those_of_its_own_picture_alone() -> None:
+    pixels = np.asarray(picture(200, 100))
+    assert count_scans(jpeg(pixels)) == 1
+    progressive = jpeg(pixels, progressive=True)
+    # Pillow's library writes ten scans of a colour picture.
+    assert count_scans(progressive) == 10
+    # Neither a preview in its tags nor what follows its end counts.
+    with_preview = jpeg(pixels, exif=exif() + progressive)
+    assert count_scans(with_preview + progressive) == 1
+    assert count_scans(b"\xff\xd8\xff\xda") == 1
+    assert count_scans(b"") == 0

@@ -317,6 +317,14 @@ def jpeg(pixels: NDArray[Any], **options: Any) -> bytes:
     return file.getvalue()
 
 
+def jpeg_of_scans(count: int) -> bytes:
+    """A flat progressive JPEG of 4 megapixels whose last scan, of a few bytes, is repeated."""
+    content = jpeg(np.full((2048, 2048), 90, np.uint8), progressive=True)
+    last_scan = content.rindex(b"\xff\xda")
+    scan = content[last_scan:-2]  # without the marker of the end
+    return content[:last_scan] + count * scan + content[-2:]
+
+
 def raw_file(
     thumbnail: NDArray[np.uint8],
     preview: bytes | NDArray[np.uint8] | None,

@@ -69,14 +69,14 @@ def serve(
         ),
     ] = 32,
     timeout: Annotated[
-        float | None,
+        float,
         typer.Option(
             min=1,
             metavar="SECONDS",
-            show_default="no limit",
-            help="Seconds that the work on a photo may take; then it fails.",
+            help="Seconds that the work on a photo, or on a file of its scene, may take; then it "
+            "fails.",
         ),
-    ] = None,
+    ] = 3600,
     allowed_host: Annotated[
         list[str] | None,
         typer.Option(

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import io
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -52,6 +53,17 @@ MAX_PIXELS = 100_000_000  # a larger image would take more than a gigabyte as fl
 # must fit the file: a strongly compressed photo has 20 pixels for each byte.
 HARMLESS_PIXELS = 32_000_000
 MAX_PIXELS_PER_BYTE = 32
+
+# A progressive JPEG goes over its pixels again with each scan, and a scan may be a few bytes: a
+# megabyte of them takes a minute. Photos have ten, so the largest ones have a billion pixels to go
+# over. Twice as many take two seconds.
+MAX_SCANNED_PIXELS = 2_000_000_000
+# A marker of a JPEG: any byte after 0xFF but those that stand for a 0xFF among a picture's bits,
+# and those that only divide these bits.
+JPEG_MARKER = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])")
+START_OF_JPEG = 0xD8
+START_OF_SCAN = 0xDA
+END_OF_JPEG = 0xD9
 
 
 class _BoundedFile(io.BufferedReader):
@@ -165,9 +177,36 @@ def _open_picture(file: BinaryIO, kind: FileKind) -> Iterator[OpenPicture]:
     if kind is TIFF:
         source, notes = _main_picture_of_tiff(file)
     with open_image(source, (kind.pillow,)) as image:
+        if kind is JPEG:
+            _check_scans(image, source)
         exif = exif_tags(image)  # now: a TIFF loses its tags when its pixels are loaded
         notes = notes or _notes_about_pictures(image, kind, source)
         yield OpenPicture(image, kind, source, exif, notes)
+
+
+def _check_scans(image: Image.Image, file: BinaryIO) -> None:
+    """ValueError for a JPEG that would be gone over too often; the file's position is kept."""
+    position = file.tell()
+    file.seek(0)
+    count = count_scans(file.read())
+    file.seek(position)
+    if count * image.width * image.height > MAX_SCANNED_PIXELS:
+        raise ValueError(f"it has {count} scans, as no camera and no program writes them")
+
+
+def count_scans(content: bytes) -> int:
+    """The number of scans of the first picture in a JPEG's bytes."""
+    count = 0
+    marker = JPEG_MARKER.search(content)
+    while marker is not None and marker[1][0] != END_OF_JPEG:
+        end = marker.end()
+        if marker[1][0] != START_OF_JPEG:
+            # Other markers begin a segment, which may hold a preview with markers of its own. Its
+            # length counts the two bytes of the length.
+            end += max(2, int.from_bytes(content[end : end + 2], "big"))
+        count += marker[1][0] == START_OF_SCAN
+        marker = JPEG_MARKER.search(content, end)
+    return count
 
 
 def _main_picture_of_tiff(file: BinaryIO) -> tuple[BinaryIO, tuple[str, ...]]:

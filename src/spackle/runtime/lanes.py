@@ -134,9 +134,10 @@ class Lane:
             if order in self._waiting:
                 self._waiting.remove(order)
                 order.outcome.set_result(CANCELLED)
-            # Under the lock, because another order may have the process a moment later.
+            # Under the lock, because another order may have the process a moment later. The thread
+            # that has the order waits for the end.
             if order.process is not None:
-                order.process.kill()
+                order.process.kill(wait=False)
 
     def cancel_all_of(self, owner: str) -> None:
         """End all orders of an owner."""

@@ -125,10 +125,11 @@ class TaskProcess:
         number: int = self._process.pid
         return number
 
-    def kill(self) -> None:
-        """End the process at once."""
+    def kill(self, *, wait: bool = True) -> None:
+        """End the process at once; `wait` for the end, which another thread may do, too."""
         self._process.kill()
-        self._process.join()
+        if wait:
+            self._process.join()
 
     def do(
         self, task: object, on_event: SendEvent, limits: TaskLimits = NO_LIMITS

@@ -345,12 +345,12 @@ class Jobs:
 
     def _forget_callback(self, id: str) -> None:
         """Note that nobody is to be told the end of a job any more."""
-        with self._lock:
-            self._change(id, callback_url=None)
+        self._change(id, callback_url=None)
+        job = self.by_id.get(id)
+        if job is not None:
             # If the disk is full, or the job has just been deleted, there is nothing to be done.
-            if id in self.by_id:
-                with contextlib.suppress(InputError, OSError):
-                    self.by_id[id].save()
+            with contextlib.suppress(InputError, OSError):
+                job.save()
 
     def warm_up(self) -> None:
         """Have a process prepare for its first photo, if its work can do that; returns at once.
@@ -578,7 +578,7 @@ class Jobs:
             if self._is_closed.is_set() or id not in self.by_id:
                 return failure
             self._scene_orders.pop(id, None)
-            self._end_or_repeat(job, failure, time.monotonic() - start)
+        self._end_or_repeat(job, failure, time.monotonic() - start)
         return failure
 
     def _make_scene(self, job: Job, order: Order) -> TaskFailure | None:
@@ -589,14 +589,17 @@ class Jobs:
             job.results.mkdir()
             job.save()
         except (OSError, InputError) as problem:
-            kind: Any = "input" if machine_fault(problem) is None else "machine"
-            return TaskFailure(kind, f"cannot be stored here: {reason_in_a_line(problem)}")
+            fault = machine_fault(problem)
+            if fault is not None:
+                return TaskFailure("machine", reason_in_a_line(fault))
+            line = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
+            return TaskFailure("input", line)
         task = (job, None)  # None: the scene, not a further file of it
         limits = TaskLimits(seconds=self.limits.work_s)
         return order.do(task, lambda event: self._note_event(job.id, event), limits)
 
     def _end_or_repeat(self, job: Job, failure: TaskFailure | None, seconds: float) -> None:
-        """Record how the work on a job has ended, or let it wait again; the lock is held.
+        """Record how the work on a job has ended, or let it wait again.
 
         Args:
             job: the job.
@@ -620,11 +623,11 @@ class Jobs:
         self.work_times[state] = WorkTimes(former.jobs + 1, former.seconds + seconds)
 
     def _try_later(self, id: str, reason: str) -> None:
-        """Keep a photo that this machine cannot complete now, and try again after a while.
-
-        The lock is held.
-        """
-        LOG.error("error: %s: %s: kept, and tried again", self.by_id[id].name, reason)
+        """Keep a photo that this machine cannot complete now, and try again after a while."""
+        job = self.by_id.get(id)
+        if job is None:  # it has been deleted, which may be the reason
+            return
+        LOG.error("error: %s: %s: kept, and tried again", job.name, reason)
         line = without_folders(f"the server cannot go on now ({reason}): it will try again")
         self._change(id, state="queued", stage=None, share=None, line=line, attempts=0)
         timer = threading.Timer(RETRY_S, self._enqueue, [id, line])
@@ -643,13 +646,16 @@ class Jobs:
     def _record_end(self, id: str, error: str | None) -> None:
         """Record a job's end on the disk, then tell clients; delete the photo, which is private.
 
-        The lock is held. OSError or InputError if the end cannot be recorded: then it has not come.
+        OSError or InputError if the end cannot be recorded: then it has not come. Without the lock,
+        because a busy disk may take a second; the folder of a deleted job has another name.
 
         Args:
             id: of the job.
             error: the reason for failure, None for a finished scene.
         """
-        job = self.by_id[id]
+        job = self.by_id.get(id)
+        if job is None:
+            return
         ended_job = job.model_copy(
             update={
                 "state": "failed" if error else "done",
@@ -660,7 +666,10 @@ class Jobs:
             }
         )
         ended_job.save()
-        self.by_id[id] = ended_job
+        with self._lock:
+            if id not in self.by_id:
+                return
+            self.by_id[id] = ended_job
         for file in (job.source, job.depth, job.mask):
             # An absolute path is a file of the user, which is not ours to delete.
             if file is not None and not os.path.isabs(file):

@@ -28,7 +28,7 @@ from spackle.results.photo_folder import REPORT_NAME, PhotoOptions, predict_phot
 from spackle.runtime.declared_options import DECLARATIONS
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic, write_json
-from spackle.runtime.progress import Reporter, StageProgress
+from spackle.runtime.progress import Progress, Reporter, StageProgress
 from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
 from spackle.video.video_formats import DEFAULT_FPS
@@ -186,8 +186,8 @@ class SceneWork:
             for name in files:
                 # Making the scene has made some of its files.
                 if not (job.results / name).exists():
-                    with reporter.stage(name):
-                        self._make_file(job.results / name, scene, job, options)
+                    with reporter.stage(name) as progress:
+                        self._make_file(job.results / name, scene, job, options, progress)
         except InputError as error:
             raise InputError(reporter.without_paths(str(error))) from error
 
@@ -320,8 +320,12 @@ class SceneWork:
             return dataclasses.replace(self.base, name=options.base, checkpoint=None)
         return self.base
 
-    def _make_file(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
+    def _make_file(
+        self, target: Path, scene: Scene, job: Job, options: SceneOptions, progress: Progress
+    ) -> None:
         """Write a video, a page or another format of a scene; the name of `target` says which.
+
+        `progress` is called for each frame of a video.
 
         InputError if the report of a photo is wanted, but the job was a scene, not a photo.
         """
@@ -334,7 +338,11 @@ class SceneWork:
         if shared is not None:
             renderer = get_renderer(self.base.device)
             scene.save_video(
-                target, options.trajectory, renderer=renderer, **dataclasses.asdict(shared)
+                target,
+                options.trajectory,
+                renderer=renderer,
+                progress=progress,
+                **dataclasses.asdict(shared),
             )
         elif target.suffix == ".mp4":
             # swipe.mp4, for example, shows the camera path "swipe"; video.mp4 shows the path of the
@@ -344,7 +352,9 @@ class SceneWork:
                 if name == target.stem:
                     trajectory = name
             renderer = get_renderer(self.base.device)
-            scene.save_video(target, trajectory, frames=options.frames, renderer=renderer)
+            scene.save_video(
+                target, trajectory, frames=options.frames, renderer=renderer, progress=progress
+            )
         elif target.suffix == ".html":
             description = json.loads((job.results / PAGE).read_bytes())
             page = scene.page_file(job.name, description["note"], viewed_as=description)

@@ -1,0 +1,116 @@
+"""Worker processes: orders wait for their turn, may be cancelled, and end at their limits."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from helpers.lane_work import work
+from helpers.systems import needs_proc
+
+from spackle.runtime.errors import InputError
+from spackle.runtime.lanes import Lane
+from spackle.runtime.task_process import (
+    CANCELLED,
+    WORKER_DIED,
+    TaskFailure,
+    TaskLimits,
+    machine_fault,
+)
+
+
+@pytest.fixture
+def lane() -> Iterator[Lane]:
+    with contextlib.closing(Lane(work, 1)) as lane:
+        yield lane
+
+
+def outcome(lane: Lane, kind: str, value: Any = None, **limits: Any) -> TaskFailure | None:
+    """How a task of an order ends."""
+    order = lane.submit("a", lambda order: order.do((kind, value), dict, TaskLimits(**limits)))
+    return order.outcome.result()
+
+
+def test_a_failure_says_whose_fault_it_is(lane: Lane) -> None:
+    assert outcome(lane, "nothing") is None
+    assert outcome(lane, "refuse") == TaskFailure("input", "a.png: no photo")
+    assert outcome(lane, "disk") == TaskFailure("machine", "No space left")
+    assert outcome(lane, "bug", "oh") == TaskFailure("bug", "internal error: KeyError: 'oh'")
+    assert outcome(lane, "die") == TaskFailure("died", WORKER_DIED)
+    assert outcome(lane, "nothing") is None
+
+
+def test_a_task_ends_at_its_limits_and_the_next_one_begins(lane: Lane) -> None:
+    assert outcome(lane, "wait", seconds=0.2) == TaskFailure(
+        "time", "took longer than 0.2 seconds, the limit"
+    )
+    too_much = outcome(lane, "compute", cpu_seconds=0)
+    assert too_much is not None
+    assert too_much.kind == "time"
+    assert outcome(lane, "nothing", seconds=60) is None
+
+
+@needs_proc
+def test_memory_has_a_limit_that_ends_with_the_task(lane: Lane) -> None:
+    size = 200_000_000
+    too_much = outcome(lane, "allocate", size, memory_bytes=size // 4)
+    assert too_much is not None
+    assert too_much.kind == "memory"
+    assert outcome(lane, "allocate", size) is None
+
+
+def test_orders_wait_in_line_and_end_with_their_owner(lane: Lane) -> None:
+    has_begun = threading.Event()
+    running = lane.submit("a", lambda order: order.do(("wait", 0), lambda event: has_begun.set()))
+    assert has_begun.wait(120)
+    second = lane.submit("b", lambda order: order.do(("nothing", 0), dict))
+    third = lane.submit("a", lambda order: order.do(("wait", 0), dict))
+    fourth = lane.submit("b", lambda order: order.do(("nothing", 0), dict))
+    assert [lane.place_of(order) for order in (running, second, third, fourth)] == [None, 0, 1, 2]
+    lane.cancel_all_of("a")
+    assert running.outcome.result() == CANCELLED
+    assert third.outcome.result() == CANCELLED
+    assert second.outcome.result() is None
+    assert fourth.outcome.result() is None
+    lane.cancel(fourth)  # too late, which does no harm
+    assert outcome(lane, "nothing") is None
+
+
+def test_a_process_has_the_environment_of_its_start(
+    lane: Lane, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    homes = []
+    for value in ("one", "two"):
+        monkeypatch.setenv("SPACKLE_TEST", value)
+        with contextlib.closing(Lane(work, 1)) as fresh:
+            order = fresh.submit("", lambda order: order.do(("nothing", 0), homes.append))
+            order.outcome.result()
+    assert [event["home"] for event in homes] == ["one", "two"]
+
+
+def test_a_closed_lane_takes_no_order() -> None:
+    lane = Lane(work, 1)
+    lane.close()
+    assert outcome(lane, "nothing") == CANCELLED
+
+
+def test_a_full_disk_is_found_behind_other_errors() -> None:
+    def failure_after(number: int) -> Exception:
+        try:
+            try:
+                raise OSError(number, os.strerror(number))
+            except OSError as error:
+                raise InputError("cannot write") from error
+        except InputError as error:
+            return error
+
+    fault = machine_fault(failure_after(errno.ENOSPC))
+    assert fault is not None
+    assert fault.errno == errno.ENOSPC
+    assert machine_fault(failure_after(errno.ENOENT)) is None
+    assert machine_fault(None) is None
