@@ -2,15 +2,14 @@
 
 An interrupted build resumes and writes the same bytes.
 
-Read `build_dataset` first. A photo's sample (its views with holes, and their targets) is first
-written to a file of its own, the part. When all photos of a shard are done, their parts become a
-tar file, the shard, and the manifest lists it.
+Read `build_dataset` first. Workers make the photos' samples (views with holes, and their targets)
+and put them together to tar files, the shards, as `ShardWriter` says. At the end the manifest lists
+all shards.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -27,13 +26,8 @@ from spackle.paper.dataset.encoding import decode_gaussians, encode_gaussians
 from spackle.paper.dataset.options import DatasetOptions, completion_facts, dataset_configuration
 from spackle.paper.dataset.photos import PhotoFile, choose_photos
 from spackle.paper.dataset.sample import pack_sample
-from spackle.paper.dataset.shards import (
-    MANIFEST_NAME,
-    PARTS_FOLDER,
-    Manifest,
-    load_manifest,
-    write_shard,
-)
+from spackle.paper.dataset.shard_writer import ShardWriter
+from spackle.paper.dataset.shards import MANIFEST_NAME, Manifest, load_manifest
 from spackle.paper.dataset.views import (
     cameras_along_path,
     complete_views,
@@ -42,9 +36,9 @@ from spackle.paper.dataset.views import (
 )
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
-from spackle.runtime.digests import config_differences, sealed
+from spackle.runtime.digests import config_differences
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import remove_half_written, write_atomic
+from spackle.runtime.files import remove_half_written
 from spackle.runtime.folders import make_folder, results_folder
 from spackle.runtime.progress import Progress, Reporter, catch_stop_signals, pluralized
 from spackle.runtime.worker_options import WorkerOptions, check_like_command
@@ -68,7 +62,8 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     """
     # Errors in options and weights come now, before any long work.
     options.check(source)
-    maker = SampleMaker(options, output / PARTS_FOLDER)
+    no_photos = ShardWriter(output, options.shard_size, photo_count=0)
+    maker = SampleMaker(options, no_photos)
     # Some inpainters have a licence that the user should know of.
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
@@ -93,32 +88,34 @@ class PhotoResult:
 class SampleMaker:
     """Makes photos' samples: Gaussians, rendered views and completed targets."""
 
-    def __init__(self, options: DatasetOptions, parts: Path) -> None:
+    def __init__(self, options: DatasetOptions, writer: ShardWriter) -> None:
         """Open the base, which turns photos into Gaussians, and the inpainter, which paints holes.
 
         Their networks are loaded with the first photo.
 
         Args:
             options: what to build.
-            parts: the folder for samples that wait for their shard.
+            writer: takes the samples.
 
         Raises:
             InputError: opening fails.
         """
         self.options = options
-        self.parts = parts
+        self.writer = writer
         self.base = open_base(options.base)
         self.renderer = get_renderer(options.base.device)
         self.inpainter = options.open_inpainter()
 
     @staticmethod
-    def open(options: DatasetOptions, parts: Path, config: Mapping[str, Any]) -> SampleMaker:
+    def open(
+        options: DatasetOptions, writer: ShardWriter, config: Mapping[str, Any]
+    ) -> SampleMaker:
         """Open the maker of a worker process.
 
         InputError if its machine would make other samples than the machine of the command, which
         has this `config`.
         """
-        maker = SampleMaker(options, parts)
+        maker = SampleMaker(options, writer)
         # On the machine of the command there is nothing to compare.
         if options.ray is None:
             return maker
@@ -129,23 +126,48 @@ class SampleMaker:
         return maker
 
     def make(self, photo: PhotoFile) -> PhotoResult:
-        """Write a photo's sample; a problem of this photo alone is a result, too.
+        """Write a photo's sample, and its shard if it was the last one of the shard.
 
-        BaseError if the network cannot be used for any photo.
+        A problem of this photo alone is a result, too. BaseError if the network cannot be used for
+        any photo.
         """
-        part = part_file(self.parts, photo)
         # A worker that died may have written the sample without saying so.
-        if part.is_file():
-            return PhotoResult(photo.index)
+        problem = None
+        if not self.writer.is_done(photo.index):
+            problem = self._write_sample(photo)
+        self.writer.write_shard_if_ready(self.writer.shard_of(photo.index))
+        return PhotoResult(photo.index, problem)
+
+    def _write_sample(self, photo: PhotoFile) -> str | None:
+        """Write a photo's sample, or the reason why it has none, which is returned."""
         try:
             sample = self._make_sample(photo)
         except BaseError:
             # The next photo would fail in the same way, so the build ends.
             raise
         except InputError as error:
-            return PhotoResult(photo.index, problem=str(error))
-        write_atomic(part, sealed(sample))
-        return PhotoResult(photo.index)
+            problem = str(error)
+            self.writer.write_problem(photo.index, self._portable_problem(photo, problem))
+            return problem
+        self.writer.write_sample(photo.index, sample)
+        return None
+
+    def _portable_problem(self, photo: PhotoFile, problem: str) -> str:
+        """The message about a photo's problem, beginning with the photo's name.
+
+        Paths of folders are left out, because they differ between machines, and the manifest must
+        not.
+        """
+        problem = problem.replace(str(photo.path), photo.name)
+        if photo.depth is not None:
+            problem = problem.replace(str(photo.depth), photo.depth.name)
+        depth_folder = self.options.base.depth
+        # A folder without a name, "." or "/", would be found anywhere in the message.
+        if isinstance(depth_folder, Path) and depth_folder.name:
+            problem = problem.replace(str(depth_folder), "the depth folder")
+        if problem.startswith(f"{photo.name}: "):
+            return problem
+        return f"{photo.name}: {problem}"
 
     def _make_sample(self, file: PhotoFile) -> bytes:
         """A photo's sample: its Gaussians, views and targets, as bytes of a tar archive.
@@ -203,11 +225,6 @@ class SampleMaker:
         )
 
 
-def part_file(parts: Path, photo: PhotoFile) -> Path:
-    """The file that holds a photo's sample until its shard is written."""
-    return parts / f"{photo.key}.tar"
-
-
 class DatasetBuild:
     """A build in progress: a dataset's photos, and the state of each."""
 
@@ -247,9 +264,10 @@ class DatasetBuild:
                 f"{output}: holds a dataset with other options ({'; '.join(changes)}): choose "
                 "another `output`"
             )
-        self.parts = output / PARTS_FOLDER
-        make_folder(self.parts)
-        remove_half_written(output, self.parts)
+        self.writer = ShardWriter(output, options.shard_size, len(photos))
+        make_folder(self.writer.parts)
+        remove_half_written(output, self.writer.parts)
+        self.writer.remove_problems()
 
         # A shard counts if its file is there, whole. Its name is shard-NUMBER.tar.
         sizes = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}
@@ -258,14 +276,17 @@ class DatasetBuild:
             if sizes.get(shard.file) == shard.size:
                 number = int(shard.file.removeprefix("shard-").removesuffix(".tar"))
                 self.shards[number] = shard
+        # The manifest of a killed build does not list its shards yet, and all parts of a shard may
+        # be there, but not the shard.
+        self._collect_shards()
 
         # Indices of photos whose sample is neither in a shard nor in a file of its own, a part.
-        self.missing = set()
-        for photo in photos:
-            is_in_shard = self._shard_number(photo.index) in self.shards
-            if not is_in_shard and not part_file(self.parts, photo).is_file():
-                self.missing.add(photo.index)
-        self.problems: dict[int, str] = {}  # why photos have no sample, by index
+        self.missing = {
+            photo.index
+            for photo in photos
+            if self.writer.shard_of(photo.index) not in self.shards
+            and not self.writer.is_done(photo.index)
+        }
 
     def run(self) -> str:
         """Make the samples that are missing, and the shards: tar files of some samples each.
@@ -288,11 +309,10 @@ class DatasetBuild:
             # single_process: a second Ctrl-C ends the program at once.
             catch_stop_signals(single_process=True) as stop_requested,
         ):
-            # A killed build may have left all parts of a shard, but not the shard.
-            for number in range(self._shard_count()):
-                self._write_shard_if_ready(number)
             self._make_samples(missing_photos, progress, stop_requested)
+        self._collect_shards()
         if self.missing:
+            self._save_manifest(complete=False)
             self.reporter.log("stopped; the same command resumes from here")
             return "stopped"
 
@@ -307,7 +327,7 @@ class DatasetBuild:
     def _make_samples(
         self, photos: Sequence[PhotoFile], progress: Progress, stop_requested: Callable[[], bool]
     ) -> None:
-        """Make the samples of photos in worker processes, and each shard as soon as it is complete.
+        """Make the samples of photos in worker processes, which also write the shards.
 
         Args:
             photos: those of the dataset's photos that are not done yet.
@@ -320,7 +340,7 @@ class DatasetBuild:
             options.workers, options.threads, options.base.device, options.ray, len(photos)
         )
         with parallel_map(
-            partial(SampleMaker.open, options, self.parts, self.config),
+            partial(SampleMaker.open, options, self.writer, self.config),
             photos,
             stop_requested,
             workers,
@@ -329,57 +349,23 @@ class DatasetBuild:
             # Results come in any order, as soon as they are made.
             for done_count, result in enumerate(results, ready_count + 1):
                 self._note(result)
-                self._write_shard_if_ready(self._shard_number(result.index))
                 progress(done_count, len(self.photos))
                 if stop_requested():
                     break
 
-    def _shard_number(self, index: int) -> int:
-        """The number of the shard that gets a photo, by the photo's index."""
-        return index // self.options.shard_size
-
-    def _shard_count(self) -> int:
-        """The number of shards; the last one may be smaller."""
-        return math.ceil(len(self.photos) / self.options.shard_size)
-
     def _note(self, result: PhotoResult) -> None:
-        """Note that a photo is done.
-
-        If the photo has no sample, the reason is logged, and kept for the manifest.
-        """
+        """Note that a photo is done; if it has no sample, the reason is logged."""
         self.missing.discard(result.index)
         if result.problem is not None:
-            self.problems[result.index] = result.problem
             self.reporter.log(f"passed over: {result.problem}")
 
-    def _write_shard_if_ready(self, number: int) -> None:
-        """Write a shard, a tar file of some photos' samples, if all of these photos are done.
-
-        Nothing happens if it is written already. First comes the shard, then its entry in the
-        manifest; then the files of its samples, the parts, are deleted. A build that is killed
-        between these steps repeats them.
-        """
-        first = number * self.options.shard_size
-        indices = range(first, min(first + self.options.shard_size, len(self.photos)))
-        if number in self.shards or not self.missing.isdisjoint(indices):
-            return
-
-        parts = []  # key and file of each sample
-        problems = []
-        for index in indices:
-            photo = self.photos[index]
-            # A photo with a problem has no sample.
-            if index in self.problems:
-                problems.append(self._portable_problem(photo, self.problems[index]))
-            else:
-                parts.append((photo.key, part_file(self.parts, photo)))
-        name = f"shard-{number:06d}.tar"
-        self.shards[number] = write_shard(parts, self.output / name, problems)
-        self._save_manifest(complete=False)
-        for _, path in parts:
-            path.unlink(missing_ok=True)
-        size = decimal(self.shards[number].size)
-        self.reporter.detail(f"  {name}: {len(parts)} photos, {size}")
+    def _collect_shards(self) -> None:
+        """Take note of all shards that are written; a shard is written now if its parts wait."""
+        for number in range(self.writer.shard_count):
+            if number not in self.shards:
+                entry = self.writer.write_shard_if_ready(number)
+                if entry is not None:
+                    self.shards[number] = entry
 
     def _save_manifest(self, *, complete: bool) -> None:
         """Write the manifest with the shards so far."""
@@ -393,10 +379,10 @@ class DatasetBuild:
         """
         if self._sample_count():
             self._save_manifest(complete=True)
-            shutil.rmtree(self.parts)
+            shutil.rmtree(self.writer.parts)
             return
 
-        shutil.rmtree(self.parts)
+        shutil.rmtree(self.writer.parts)
         # An empty dataset would only puzzle whoever finds it.
         shards = self.shards.values()
         for name in (MANIFEST_NAME, *(shard.file for shard in shards)):
@@ -416,20 +402,3 @@ class DatasetBuild:
     def _sample_count(self) -> int:
         """The number of photos in shards."""
         return sum(len(shard.samples) for shard in self.shards.values())
-
-    def _portable_problem(self, photo: PhotoFile, problem: str) -> str:
-        """The message about a photo's problem, beginning with the photo's name.
-
-        Paths of folders are left out, because they differ between machines, and the manifest must
-        not.
-        """
-        problem = problem.replace(str(photo.path), photo.name)
-        if photo.depth is not None:
-            problem = problem.replace(str(photo.depth), photo.depth.name)
-        depth_folder = self.options.base.depth
-        # A folder without a name, "." or "/", would be found anywhere in the message.
-        if isinstance(depth_folder, Path) and depth_folder.name:
-            problem = problem.replace(str(depth_folder), "the depth folder")
-        if problem.startswith(f"{photo.name}: "):
-            return problem
-        return f"{photo.name}: {problem}"

@@ -30,7 +30,12 @@ class PhotoFile:
     @property
     def key(self) -> str:
         """The photo's number as text, with which the names of its files in the dataset begin."""
-        return f"{self.index:06d}"
+        return photo_key(self.index)
+
+
+def photo_key(index: int) -> str:
+    """The number of a dataset's photo as text, such as "000012"."""
+    return f"{index:06d}"
 
 
 def choose_photos(
