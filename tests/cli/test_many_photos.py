@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.command import Run, names_in, report_of, run
+from helpers.command import Run, names_in, refuses, report_of, run
 from helpers.flat_base import QUICK, write_small_photos
 from helpers.photos import metres, write_depth
 
 import spackle.results.many_photos as many_photos
+from spackle.formats.scene_files import load_scene
 from spackle.results.results_file import RESULTS_NAME
 
 
@@ -110,3 +111,41 @@ def test_a_tree_and_a_list_are_predicted_with_the_depth_and_lens_that_the_list_s
     (photos / "photos.jsonl").write_text("\n".join(map(json.dumps, lines)))
     again = run("predict", photos / "photos.jsonl", "-o", listed, *options)
     assert "1 of 3 photos done already (--overwrite does them again)" in again.lines
+
+
+def test_outputs_name_the_files_of_a_photo(tmp_path: Path) -> None:
+    photo = write_small_photos(tmp_path, "a.png") / "a.png"
+    flags = ("--base", "helpers.flat_base:Flat", "--threads", 1, "--overwrite")
+
+    def written(outputs: str, *more: object) -> set[str]:
+        result = run("predict", photo, "-o", tmp_path, *flags, "--outputs", outputs, *more)
+        assert result.code == 0, result.err
+        names = set(report_of(tmp_path / "a")["files"])
+        for name in names:
+            assert (tmp_path / "a" / name).stat().st_size > 0
+        return names
+
+    scenes = {"scene.spz", "scene.ply", "scene.html", "base.ply"}
+    assert written(f"{','.join(scenes)}, video.gif", "--frames", 2) == {*scenes, "video.gif"}
+    assert len(load_scene(tmp_path / "a" / "scene.spz").gaussians) == len(
+        load_scene(tmp_path / "a" / "scene.ply").gaussians
+    )
+    # What shows no filled hole needs no fill.
+    assert written("depth.npy,base.spz,report.json") == {"depth.npy", "base.spz"}
+    report = report_of(tmp_path / "a")
+    assert (report["residual"]["weights"], report["aux"]["gaussians"]) == ("none", 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["scene.spx"], "--outputs scene.spx is unknown: did you mean scene.spz? There are scene"),
+        ([","], "names no file: there are scene.compressed.ply"),
+        (["video.mp4,video.gif"], "give one of them"),
+        (["scene.ply", "--keep-base"], "leave --keep-base out"),
+        (["scene.ply", "--format", "gif"], "no video.gif is among them: leave --format out"),
+        (["base.ply", "--fill", "lama"], "none of them shows filled holes: leave --fill out"),
+    ],
+)
+def test_outputs_that_cannot_be_are_refused(tmp_path: Path, options: list[str], said: str) -> None:
+    refuses(run("predict", tmp_path / "a.png", "-o", tmp_path / "o", "--outputs", *options), said)

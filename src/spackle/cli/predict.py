@@ -97,6 +97,14 @@ def predict(
     ] = None,
     fill: Annotated[str, declared("fill", metavar="NAME")] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
+    outputs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="The files of each photo, such as scene.spz,depth.npy; see docs/scale.md.",
+            show_default="scene.ply,video.mp4,report.json",
+        ),
+    ] = None,
     keep_base: Annotated[
         bool,
         typer.Option(
@@ -166,7 +174,39 @@ def predict(
     from spackle.cli.messages import CommandReporter
     from spackle.pipeline import FillOptions, PipelineOptions
     from spackle.results.many_photos import PredictOptions
-    from spackle.results.photo_folder import PhotoOptions
+    from spackle.results.outputs import parse_outputs
+    from spackle.results.photo_folder import SCENE_NAME, PhotoOptions
+
+    gaussian_files: tuple[str, ...] = (SCENE_NAME,)
+    views = True
+    if outputs is not None:
+        # `outputs` names all files, so the options that add or leave out one would contradict it.
+        others: dict[str, object] = {
+            "no_render": not render,
+            "keep_base": keep_base,
+            "depth_out": depth_out,
+        }
+        others |= {"posed": posed}
+        for option, value in others.items():
+            if value:
+                raise InputError(f"`outputs` {outputs}: names all files: leave `{option}` out")
+        files = parse_outputs(outputs)
+        gaussian_files = files.gaussian_files
+        views = files.views
+        depth_out = files.depth
+        render = files.video_format is not None
+        if video_format not in (None, files.video_format):
+            raise InputError(
+                f"`outputs` {outputs}: no video.{video_format} is among them: leave `format` out"
+            )
+        video_format = files.video_format
+        if not files.needs_fill:
+            if residual is not None or fill != "auto":
+                option = "fill" if residual is None else "residual"
+                raise InputError(
+                    f"`outputs` {outputs}: none of them shows filled holes: leave `{option}` out"
+                )
+            residual = "none"
 
     # Each stage has its own options: the base, the camera path with its video, the fill, and the
     # files that are written.
@@ -216,6 +256,8 @@ def predict(
             depth_out=depth_out,
             keep_frame=keep_frame,
             timeless_report=tar is not None,
+            gaussian_files=gaussian_files,
+            views=views,
         ),
         tar=tar,
         overwrite=overwrite,

@@ -36,6 +36,8 @@ RESULT_FILES = (VIDEO_FILE, REPORT_FILE)
 # the first.
 FRAME_NAME = "{:06d}"
 
+DEFAULT_PHOTO_OPTIONS = PhotoOptions(lens={})  # those of a command without options
+
 
 def clip_options(
     scene: PipelineOptions, photo: PhotoOptions, workers: int | None
@@ -90,6 +92,8 @@ def _check_options_suit_clips(
         unsuitable.append("mode")
     if scene.fill.fill in ("exemplar", "lama"):
         unsuitable.append("fill")
+    if photo.gaussian_files != DEFAULT_PHOTO_OPTIONS.gaussian_files:
+        unsuitable.append("outputs")
     if photo.depth_out is not None:
         unsuitable.append("depth_out")
     if not photo.render:

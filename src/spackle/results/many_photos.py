@@ -27,6 +27,7 @@ from spackle.pipeline import Pipeline, PipelineOptions
 from spackle.render.blend import blend_tiles
 from spackle.results.photo_folder import (
     REPORT_NAME,
+    SCENE_NAME,
     PhotoOptions,
     predict_photo,
     read_earlier_report,
@@ -257,7 +258,10 @@ def _predict_in_this_process(
 
 def _say_where_to_look(folder: Path, options: PredictOptions, reporter: Reporter) -> None:
     """Log a line that names the video and the command that shows the scene."""
-    view_command = f"spackle view {shlex.quote(str(folder / 'scene.ply'))}"
+    if SCENE_NAME not in options.photo.gaussian_files:
+        reporter.log(f"Look into {folder}")
+        return
+    view_command = f"spackle view {shlex.quote(str(folder / SCENE_NAME))}"
     if options.photo.render:
         video = folder / f"video{options.scene.path.video.suffix}"
         reporter.log(f"Look at {video}, or into the scene: {view_command}")

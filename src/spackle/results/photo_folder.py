@@ -21,17 +21,22 @@ from spackle.bases.open import ResolvedBase
 from spackle.core.photo import Photo, load_photo
 from spackle.depth.writers import save_depth
 from spackle.formats import save_gray_png, save_ply, save_png
+from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_files import encoder_for
 from spackle.pipeline import CompletedPhoto, Pipeline
 from spackle.render import Renderer
 from spackle.residual import hole_mask
 from spackle.runtime.digests import file_records
-from spackle.runtime.files import write_json
+from spackle.runtime.files import write_atomic, write_json
 from spackle.runtime.folders import atomic_files, results_folder
 from spackle.runtime.progress import Progress, Reporter
-from spackle.scene import ViewHoles
+from spackle.scene import Scene, ViewHoles
 from spackle.video.encoding import save_video
 
 REPORT_NAME = "report.json"
+SCENE_NAME = "scene.ply"
+PAGE_NAME = "scene.html"  # viewer and scene in one file
+VIEWS_NAME = "views"  # the folder with pictures of given views
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,6 +50,14 @@ class PhotoOptions:
     keep_frame: bool = False  # keep a uniform frame around the photo
     # Leave the times out of report.json, whose bytes then depend on input and options alone.
     timeless_report: bool = False
+    # Files of Gaussians: those of the whole scene, such as scene.spz, and of the base, base.ply.
+    gaussian_files: tuple[str, ...] = (SCENE_NAME,)
+    views: bool = True  # write pictures of the views that the user gives, if any
+
+    @property
+    def all_gaussian_files(self) -> tuple[str, ...]:
+        """The names of all files of Gaussians."""
+        return (*self.gaussian_files, "base.ply") if self.keep_base else self.gaussian_files
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -192,9 +205,9 @@ def predict_photo(
         # second run out of this photo's folder.
         names = _result_names(pipeline, options)
         folders.enter_context(results_folder(folder, names, locked=True))
-        picture_names = _picture_names(pipeline)
+        picture_names = _picture_names(pipeline) if options.views else []
         if picture_names:
-            folders.enter_context(results_folder(folder / "views", picture_names))
+            folders.enter_context(results_folder(folder / VIEWS_NAME, picture_names))
 
         completed = pipeline.complete(photo, reporter)
 
@@ -220,9 +233,7 @@ def predict_photo(
 
 def _result_names(pipeline: Pipeline, options: PhotoOptions) -> list[str]:
     """The names of the files that `predict_photo` writes, without the pictures of given views."""
-    names = ["scene.ply", REPORT_NAME]
-    if options.keep_base:
-        names.append("base.ply")
+    names = [*options.all_gaussian_files, REPORT_NAME]
     if options.render:
         names.append(_video_name(pipeline))
     if options.depth_out is not None:
@@ -259,19 +270,8 @@ def _write_files(
     scene = completed.scene
     views = completed.views
     with reporter.stage("write"):
-        gaussians_by_file = {"scene.ply": scene.gaussians}
-        if options.keep_base:
-            gaussians_by_file["base.ply"] = scene.base
-        for name, gaussians in gaussians_by_file.items():
-            save_ply(
-                gaussians,
-                folder / name,
-                camera=scene.camera,
-                # The Gaussians after this number are those that completion has added.
-                base_count=len(scene.base),
-                disparity=scene.disparity,
-                is_metric=scene.is_metric,
-            )
+        for name in options.all_gaussian_files:
+            _write_gaussians(scene, folder / name, completed.photo.path.stem)
         if options.depth_out is not None:
             save_depth(scene.depth_map(pipeline.renderer), folder / options.depth_out)
 
@@ -284,11 +284,43 @@ def _write_files(
         with reporter.stage("video") as progress:
             save_planned_video(completed, folder / video_name, pipeline.renderer, progress)
 
-    if views.given_view_count:
-        (folder / "views").mkdir()
+    if views.given_view_count and options.views:
+        (folder / VIEWS_NAME).mkdir()
         with reporter.stage("views") as progress:
-            _save_pictures(completed, folder / "views", pipeline.renderer, progress)
+            _save_pictures(completed, folder / VIEWS_NAME, pipeline.renderer, progress)
     return video_entry
+
+
+def _write_gaussians(scene: Scene, path: Path, title: str) -> None:
+    """Write a scene, or of a file whose name begins with "base" its base alone.
+
+    The suffix decides the format; `title` is that of a page.
+    """
+    if path.name == PAGE_NAME:
+        write_atomic(path, scene.page_file(title))
+        return
+    gaussians = scene.base if path.name.startswith("base.") else scene.gaussians
+    # A PLY is written in parts, and so needs little memory.
+    if path.name in (SCENE_NAME, "base.ply"):
+        save_ply(
+            gaussians,
+            path,
+            camera=scene.camera,
+            # The Gaussians after this number are those that completion has added.
+            base_count=len(scene.base),
+            disparity=scene.disparity,
+            is_metric=scene.is_metric,
+        )
+        return
+    content = SceneFile(
+        path=path,
+        gaussians=gaussians,
+        camera=scene.camera,
+        base_count=len(scene.base),
+        disparity=scene.disparity,
+        is_metric=scene.is_metric,
+    )
+    write_atomic(path, encoder_for(path)(content))
 
 
 def save_planned_video(
