@@ -37,6 +37,8 @@ from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.evaluation.case import load_case
 from spackle.paper.evaluation.datasets import find_dataset, find_scenes, read_cases
 from spackle.paper.evaluation.datasets.labels import read_label
+from spackle.paper.evaluation.folder import load_run
+from spackle.paper.evaluation.tables import make_tables
 from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.runtime.digests import json_digest
@@ -206,6 +208,8 @@ def _read_photo(folder: Path) -> None:
         check_photo(path, "photo", Path(place, "preview.jpg"))
 
 
+BOMBS = ("scene_bombs", "picture_bombs")  # readers whose seeds are refused
+
 READERS: dict[str, Callable[[Path], object]] = {
     "pictures": lambda folder: resize_photo(load_photo(_only(folder), keep_frame=False), 32),
     "depth": _read_depth,
@@ -222,7 +226,11 @@ READERS: dict[str, Callable[[Path], object]] = {
     "coco": lambda folder: list(photos_of(folder / "a.json", folder=folder / "images", log=_say)),
     "datasets": _read_dataset,
     "weights": _read_weights,
+    "runs": lambda folder: make_tables([load_run(folder)], with_unmeasured=True),
     "clips": _read_clip,
+    # Small files that claim huge scenes and pictures: whole, they are refused.
+    "scene_bombs": lambda folder: load_scene(_only(folder)),
+    "picture_bombs": lambda folder: resize_photo(load_photo(_only(folder), keep_frame=False), 32),
     **{
         name: partial(_read_tree, name)
         for name in ("middlebury", "booster", "wildrgbd", "llff", "pairs")

@@ -28,6 +28,7 @@ from spackle.paper.evaluation.measurements import (
     Run,
     image_measurement,
 )
+from spackle.paper.evaluation.stored_runs import check_config, read_row
 from spackle.paper.evaluation.table import NOT_RUN
 from spackle.runtime.digests import (
     config_differences,
@@ -103,12 +104,15 @@ def load_run(folder: Path) -> Run:
 
     with as_input_error(measurements_path, DAMAGED):
         lines = measurements_path.read_text("utf-8").splitlines()
-        measurements = [Measurement(**json.loads(line)) for line in lines]
+        measurements = [read_row(line) for line in lines]
+        if not measurements:
+            raise ValueError("no measurements")
 
     with as_input_error(config_path, DAMAGED):
         config = json.loads(config_path.read_text("utf-8"))
         if config.pop("format") != FORMAT_VERSION:
             raise ValueError("of another version")  # the reason in the InputError's message
+        check_config(config)
         about = config.pop("about")
         return Run(config, measurements, about)
 
