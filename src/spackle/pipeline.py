@@ -26,6 +26,7 @@ from spackle.bases.settings import BaseSettings
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo, check_photo_size
+from spackle.core.trajectories import DepthRange
 from spackle.depth.units import RELATIVE_KINDS, UNIT_ADVICE
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
@@ -313,6 +314,10 @@ class Pipeline:
             reporter.log(f"{name}: {describe_depth(prediction.notes)}")
         for line in self._depth_warnings(prediction):
             warn(f"{name}: {line}")
+        if follows_trajectory:
+            specks = describe_specks(prediction.gaussians)
+            if specks:
+                warn(f"{name}: {specks}")
         return PredictedPhoto(prediction=prediction, base=base, warnings=tuple(warnings))
 
     def _depth_warnings(self, prediction: BasePrediction) -> list[str]:
@@ -478,6 +483,19 @@ def describe_depth(notes: Mapping[str, float | int | str]) -> str:
     return (
         f"{line}; if that is wrong, give {UNIT_ADVICE}, or for relative depth "
         f"`depth_kind` {' or '.join(RELATIVE_KINDS)}"
+    )
+
+
+def describe_specks(gaussians: Gaussians) -> str:
+    """A line about specks far before all surfaces, by which the camera moves; "" without specks."""
+    depths = DepthRange.of_specks(gaussians)
+    if depths is None:
+        return ""
+    near, percent = depths
+    return (
+        f"less than 1 % of the scene is as near as {near:.3g}, and the rest begins at "
+        f"{percent:.3g}: the camera moves only as far as the nearest part allows; if that part is "
+        "specks, clean the depth map"
     )
 
 

@@ -265,7 +265,8 @@ def relative_depth(
             f"`near` {near:g}, `far` {far:g}: give two distances in metres, the nearer one first"
         )
     known = stored.known
-    values = stored.numbers.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # some NaN of a damaged file cannot be converted quietly
+        values = stored.numbers.astype(np.float64)
     low, high = _low_and_high_quantile(values[known], stored.path)
 
     # 0 at the low quantile, 1 at the high quantile. Numbers beyond the quantiles are outside of

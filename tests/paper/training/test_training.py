@@ -264,10 +264,13 @@ def test_a_folder_with_another_recipe_is_refused(place: Path, out: Path) -> None
     with file_lock(out / ".lock"):
         assert "another run is at work" in train(place, out, "optim.steps=7").err
     refuses(train(place, out, "optim.lr=2e-3"), "holds a run with other settings (optim.lr)")
+    half_picture = out / "pictures" / ".0000009.0123456789ab.png"  # of a run that was killed
+    half_picture.touch()
     assert (
         train(place, out, "run.validate_every=2", "optim.steps=7").code,
         state(out).progress.step,
     ) == (0, 7)
+    assert not half_picture.exists()
     done = train(place, out, "optim.lr=2e-3", "optim.steps=1", "--overwrite")
     assert (done.code, state(out).progress.step) == (0, 1)
     assert names_in(out / "pictures") == {"0000001.png"}

@@ -48,6 +48,7 @@ from spackle.paper.training.schedule import ema_decay, learning_rate, prefetch, 
 from spackle.paper.training.task import Task
 from spackle.runtime.device import pick_device
 from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import remove_half_written
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter, catch_stop_signals
 
@@ -112,6 +113,10 @@ def train(
         stack.enter_context(as_input_error(output, "cannot write: {reason}", OSError))
         if overwrite and rank() == 0:
             remove_run(output)
+        # A run that was killed may have left half a picture; the lock keeps others away.
+        pictures = output / PICTURES_FOLDER
+        if rank() == 0 and pictures.is_dir():
+            remove_half_written(pictures)
 
         run = open_run(recipe, task, device, output, reporter, facts)
         if checkpoint is not None:
