@@ -15,9 +15,14 @@ from helpers.training_runs import state
 from safetensors.torch import load_file, save
 
 from spackle.bases import BasePrediction
-from spackle.paper.dataset import build
 from spackle.paper.dataset.inspect import find_problems
-from spackle.paper.dataset.shards import MANIFEST_NAME, Manifest, load_manifest, read_part
+from spackle.paper.dataset.shards import (
+    MANIFEST_NAME,
+    PARTS_FOLDER,
+    Manifest,
+    load_manifest,
+    read_part,
+)
 from spackle.paper.evaluation.folder import _load_image_results
 from spackle.paper.evaluation.measurements import image_measurement
 from spackle.paper.training import sample_factory, samples
@@ -206,7 +211,7 @@ def a_sample_target(path: Path) -> torch.Tensor:
 def test_verify_finds_a_flipped_bit_in_a_part_of_an_unfinished_dataset(tmp_path: Path) -> None:
     Manifest(config={}, shards=(), complete=False).save(tmp_path)
     assert (tmp_path / MANIFEST_NAME).is_file()
-    part = tmp_path / build.PARTS_FOLDER / "a.tar"
+    part = tmp_path / PARTS_FOLDER / "a.tar"
     part.parent.mkdir()
     content = sealed(bytes(1000))
     part.write_bytes(content)
