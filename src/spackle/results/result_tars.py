@@ -22,7 +22,7 @@ from typing import Any
 from spackle.results.photo_folder import REPORT_NAME
 from spackle.results.photo_names import NamedPhoto
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import atomic_path
+from spackle.runtime.files import atomic_path, remove_half_written
 
 STAGING_NAME = "staging"
 FILE_MODE = 0o644  # of files in a tar: everybody may read them
@@ -55,6 +55,7 @@ class ResultTars:
         self._size = size
         self._remaining_counts: list[int] = []  # photos of each tar that are not done yet
         self._in_tar = bytearray(len(photos))  # 1: an earlier run has put its results into the tar
+        remove_half_written(output)  # such as the tar that a killed run was writing
         self._present = set(os.listdir(output))
         # The reports in the tar that was asked for last, with their sizes, by the photos' keys.
         self._reports_tar = ""
