@@ -149,7 +149,12 @@ def test_a_run_that_ends_around_a_tar_goes_on_with_the_same_bytes(
         assert predict(place, out).code == 130
     assert (out / TARS[0]).exists() == (moment == "after")
     assert (out / "staging" / "1" / "scene.ply").exists()
-    (out / f".{TARS[0][:-4]}.0123456789ab.tar").touch()  # as a kill leaves it
+    # As kills leave them, while a tar is written and while its folders are removed.
+    (out / f".{TARS[0][:-4]}.0123456789ab.tar").touch()
+    if moment == "after":
+        (out / "staging" / "1" / "report.json").unlink()
+    (out / "staging" / "2").mkdir(exist_ok=True)
+    (out / "staging" / "2" / ".lock").touch()
     assert predict(place, out).code == 1
     assert_same(out, place / "whole")
 

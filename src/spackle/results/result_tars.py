@@ -178,6 +178,7 @@ class ResultTars:
         staged = [photo for photo in photos if (self.staging / photo.name / REPORT_NAME).exists()]
         # All photos may have failed, or be in the tar already.
         if not staged:
+            self._remove_staged(photos)
             return
         path = self._output / self.name_of(photos[0])
         with contextlib.ExitStack() as stack:
@@ -201,7 +202,11 @@ class ResultTars:
                 elif earlier is not None and self._in_tar[photo.number]:
                     for member in kept_members.get(key, []):
                         tar.addfile(member, earlier.extractfile(member))
-        for photo in staged:
+        self._remove_staged(photos)
+
+    def _remove_staged(self, photos: Sequence[NamedPhoto]) -> None:
+        """Remove what is in staging of photos that are all done, also what a kill has left."""
+        for photo in photos:
             shutil.rmtree(self.staging / photo.name, ignore_errors=True)
 
 
