@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -165,10 +166,17 @@ def test_a_killed_run_of_workers_ends_with_the_same_tars(place: Path, tmp_path: 
     out = tmp_path / "out"
     command = [sys.executable, "-m", "spackle", *map(str, words(place, out)), "--workers", "2"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True
+    ) as process:
         while not list(out.glob("results-*.tar")) and process.poll() is None:
             time.sleep(0.01)
         process.kill()
+    # Its workers end by themselves, a moment later.
+    with contextlib.suppress(ProcessLookupError):
+        while True:
+            os.killpg(process.pid, 0)
+            time.sleep(0.01)
     written = {tar: tar.stat().st_mtime_ns for tar in out.glob("results-*.tar")}
     assert predict(place, out).code == 1
     assert_same(out, place / "whole")
