@@ -131,6 +131,7 @@ export function fit(viewer, photo = null) {
   const scale = Math.min(width / W, height / H);
   const [w, h] = [W, H].map((side) => Math.max(1, Math.floor(side * scale)));
   Object.assign(element("frame").style, { width: `${w}px`, height: `${h}px` });
+  document.body.style.setProperty("--below", `${(height - h) / 2}px`); // what the area leaves below the picture
   viewer.resize(w, h);
 }
 
