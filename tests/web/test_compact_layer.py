@@ -46,6 +46,7 @@ def hills() -> Gaussians:
     )
 
 
+@pytest.mark.slow
 def test_a_sent_page_takes_less_than_half_and_looks_the_same(browser: Any, tmp_path: Path) -> None:
     torch.manual_seed(4)
     scene = hills()

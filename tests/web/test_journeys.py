@@ -47,7 +47,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 def visit(browser: Any, server: Served) -> Iterator[Opened]:
     """The empty page, on whose console nothing is said but that the server refuses a photo."""
     found = opened(browser, address(server))
-    found.page.set_default_timeout(90_000)  # ms
     settled(found.page, "spackle.ready")
     yield found
     # The browser notes each refused photo.
