@@ -84,7 +84,8 @@ def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path) -> None:
         refuses(result, "--base auto is not allowed here, because the results name their base")
     refuses(
         build(tmp_path, "--base", "rgbd"),
-        "--depth FOLDER; sharp, moge, lite, hf:NAME_OR_FOLDER need no depth",
+        "--depth FOLDER, or a manifest",
+        "sharp, moge, lite, hf:NAME_OR_FOLDER need no depth",
     )
     assert not (tmp_path / "out").exists()
 

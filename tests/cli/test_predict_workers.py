@@ -52,10 +52,11 @@ def predict(place: Path, out: Path, *options: object) -> Run:
 
 
 def content(out: Path) -> Iterator[Any]:
-    """All files; of reports and of results.jsonl all but the times and the sizes of reports."""
+    """All files; of reports and of results.jsonl all but times, states and the sizes of reports."""
     for line in (out / RESULTS_NAME).read_text().splitlines():
         result = json.loads(line)
         assert result.pop("seconds") >= 0
+        result.pop("state", None)  # changes with the times of files
         assert result.get("files", {"report.json": 1000}).pop("report.json") > 0
         yield result
     for folder in sorted(path for path in out.iterdir() if path.is_dir()):

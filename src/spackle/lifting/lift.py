@@ -11,7 +11,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.depth.depth_map import DepthMap, is_valid_depth
+from spackle.depth.depth_map import MIN_DEPTH_M, DepthMap
 from spackle.lifting.edges import find_edges
 from spackle.lifting.open_pixels import assign_open_pixels
 from spackle.lifting.quadtree import TILE_LEVELS
@@ -51,7 +51,9 @@ def lift_depth_map(
     """
     rgb = rgb.detach().float().contiguous()
     z = depth.depth.detach().float()
-    known = (depth.valid & is_valid_depth(z)).contiguous().numpy()  # [h, w]
+    # The inverse of a smaller depth overflows. A network may put the sky at any distance.
+    is_safe = torch.isfinite(z) & (z >= MIN_DEPTH_M)
+    known = (depth.valid & is_safe).contiguous().numpy()  # [h, w]
     inverse_depth = np.zeros(known.shape, np.float32)
     np.divide(1, z.numpy(), out=inverse_depth, where=known)
 
