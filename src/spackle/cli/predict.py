@@ -5,6 +5,7 @@ Options for few users are hidden; --help-all shows them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,6 +49,7 @@ from spackle.runtime.errors import InputError
 
 if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.results.many_photos import PredictOptions
+    from spackle.results.outputs import Outputs
     from spackle.runtime.progress import Reporter
 
 
@@ -181,31 +183,21 @@ def predict(
     views = True
     if outputs is not None:
         # `outputs` names all files, so the options that add or leave out one would contradict it.
-        others: dict[str, object] = {
+        others = {
             "no_render": not render,
             "keep_base": keep_base,
             "depth_out": depth_out,
+            "posed": posed,
         }
-        others |= {"posed": posed}
-        for option, value in others.items():
-            if value:
-                raise InputError(f"`outputs` {outputs}: names all files: leave `{option}` out")
+        _check_only_outputs(outputs, others)
         files = parse_outputs(outputs)
+        _check_suits_outputs(outputs, files, video_format, residual, fill)
         gaussian_files = files.gaussian_files
         views = files.views
         depth_out = files.depth
         render = files.video_format is not None
-        if video_format not in (None, files.video_format):
-            raise InputError(
-                f"`outputs` {outputs}: no video.{video_format} is among them: leave `format` out"
-            )
         video_format = files.video_format
         if not files.needs_fill:
-            if residual is not None or fill != "auto":
-                option = "fill" if residual is None else "residual"
-                raise InputError(
-                    f"`outputs` {outputs}: none of them shows filled holes: leave `{option}` out"
-                )
             residual = "none"
 
     # Each stage has its own options: the base, the camera path with its video, the fill, and the
@@ -281,11 +273,38 @@ def predict(
         raise typer.Exit(1)
 
 
+def _check_only_outputs(outputs: str, others: Mapping[str, object]) -> None:
+    """InputError if an option beside `outputs` adds or leaves out a file.
+
+    Args:
+        outputs: the names of the files, as the user has written them.
+        others: the values of such options, by their Python names; empty ones were not given.
+    """
+    for option, value in others.items():
+        if value:
+            raise InputError(f"`outputs` {outputs}: names all files: leave `{option}` out")
+
+
+def _check_suits_outputs(
+    outputs: str, files: Outputs, video_format: str | None, residual: str | None, fill: str
+) -> None:
+    """InputError for an option that none of the files in `outputs` shows; `files` is its meaning.
+
+    The other arguments are options of the command.
+    """
+    if video_format not in (None, files.video_format):
+        raise InputError(
+            f"`outputs` {outputs}: no video.{video_format} is among them: leave `format` out"
+        )
+    if not files.needs_fill and (residual is not None or fill != "auto"):
+        option = "fill" if residual is None else "residual"
+        raise InputError(
+            f"`outputs` {outputs}: none of them shows filled holes: leave `{option}` out"
+        )
+
+
 def _check_suits_posed(
-    posed: Path,
-    photos: list[Path] | None,
-    trajectory: str | None,
-    overscan: float | None,
+    posed: Path, photos: list[Path] | None, trajectory: str | None, overscan: float | None
 ) -> None:
     """InputError for arguments that contradict a folder of photos with known cameras."""
     if photos:

@@ -431,21 +431,14 @@ class Predictor:
                 time.
         """
         folder = self.output / photo.name
-        sizes = {name: record["bytes"] for name, record in files.items()}
-        sizes[REPORT_NAME] = (folder / REPORT_NAME).stat().st_size
+        sizes = _file_sizes(files, (folder / REPORT_NAME).stat().st_size)
         state = None
         if input_facts is not None:
             # Results that go into a tar are not looked at again.
             names = sizes if self.options.tar is None else ()
             state = self._state_of(folder, names, input_facts)
-        return {
-            "name": photo.name,
-            "photo": str(photo.path),
-            "status": OK,
-            "seconds": None if seconds is None else round(seconds, 3),
-            "files": sizes,  # in bytes
-            "state": state,
-        }
+        rounded_seconds = None if seconds is None else round(seconds, 3)
+        return _completed_line(photo, rounded_seconds, sizes, state)
 
     def _pipeline_of(self, photo: NamedPhoto) -> Pipeline:
         """The pipeline for a photo: that of all photos, or one for the depth that a list names.
@@ -573,15 +566,8 @@ class Predictor:
         if not has_same_request:
             return None
         tars.keep(photo)
-        sizes = {name: record["bytes"] for name, record in report["files"].items()}
-        return {
-            "name": photo.name,
-            "photo": str(photo.path),
-            "status": OK,
-            "seconds": earlier_line.get("seconds"),
-            "files": {**sizes, REPORT_NAME: report_size},
-            "state": state,
-        }
+        sizes = _file_sizes(report["files"], report_size)
+        return _completed_line(photo, earlier_line.get("seconds"), sizes, state)
 
     def _input_facts(self, photo: NamedPhoto) -> list[object] | None:
         """Size and time of last change of the photo and of what belongs to it, and its lens.
@@ -644,6 +630,38 @@ class Predictor:
             for calibration in calibration_candidates(depth_file):
                 if calibration.is_file():
                     yield calibration, "calibration"
+
+
+def _file_sizes(files: Mapping[str, Mapping[str, Any]], report_size: int) -> dict[str, int]:
+    """The sizes in bytes of a photo's files, by name.
+
+    Args:
+        files: the records of all files but the report, as the report has them.
+        report_size: of the report itself.
+    """
+    sizes: dict[str, int] = {name: record["bytes"] for name, record in files.items()}
+    return {**sizes, REPORT_NAME: report_size}
+
+
+def _completed_line(
+    photo: NamedPhoto, seconds: float | None, sizes: Mapping[str, int], state: str | None
+) -> Mapping[str, Any]:
+    """The line of results.jsonl for a photo with results.
+
+    Args:
+        photo: the photo.
+        seconds: that it took; None: unknown.
+        sizes: of its files, in bytes.
+        state: what `Predictor._state_of` returned; None: predict again next time.
+    """
+    return {
+        "name": photo.name,
+        "photo": str(photo.path),
+        "status": OK,
+        "seconds": seconds,
+        "files": sizes,
+        "state": state,
+    }
 
 
 def options_digest(options: PredictOptions) -> str:

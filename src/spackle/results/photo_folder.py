@@ -21,8 +21,6 @@ from spackle.bases.open import ResolvedBase
 from spackle.core.photo import Photo, load_photo
 from spackle.depth.writers import save_depth
 from spackle.formats import save_gray_png, save_ply, save_png
-from spackle.formats.scene_content import SceneFile
-from spackle.formats.scene_files import encoder_for
 from spackle.pipeline import CompletedPhoto, Pipeline
 from spackle.render import Renderer
 from spackle.residual import hole_mask
@@ -299,11 +297,13 @@ def _write_gaussians(scene: Scene, path: Path, title: str) -> None:
     if path.name == PAGE_NAME:
         write_atomic(path, scene.page_file(title))
         return
-    gaussians = scene.base if path.name.startswith("base.") else scene.gaussians
+    # A scene without what was added is that of its base.
+    has_aux = not path.name.startswith("base.")
+    shown = scene if has_aux else dataclasses.replace(scene, aux=scene.aux.select(slice(0, 0)))
     # A PLY is written in parts, and so needs little memory.
     if path.name in (SCENE_NAME, "base.ply"):
         save_ply(
-            gaussians,
+            shown.gaussians,
             path,
             camera=scene.camera,
             # The Gaussians after this number are those that completion has added.
@@ -312,15 +312,7 @@ def _write_gaussians(scene: Scene, path: Path, title: str) -> None:
             is_metric=scene.is_metric,
         )
         return
-    content = SceneFile(
-        path=path,
-        gaussians=gaussians,
-        camera=scene.camera,
-        base_count=len(scene.base),
-        disparity=scene.disparity,
-        is_metric=scene.is_metric,
-    )
-    write_atomic(path, encoder_for(path)(content))
+    shown.export(path)
 
 
 def save_planned_video(

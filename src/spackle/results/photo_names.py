@@ -71,12 +71,12 @@ def result_names(photos: Sequence[ListedPhoto]) -> list[str]:
     # Windows and macOS do not distinguish them.
     whole_names = [photo.name.casefold() for photo in photos]
     short_names = [os.path.splitext(photo.name)[0] for photo in photos]
-    taken = {*whole_names, *_folders_of(whole_names), *RESERVED_NAMES}
+    folders = _folders_of(whole_names)
+    taken = {*whole_names, *folders, *RESERVED_NAMES}
     counts = Counter(name.casefold() for name in short_names)
 
     names: list[str] = []
     photo_of: dict[str, ListedPhoto] = {}
-    folders = _folders_of(whole_names)
     for photo, short_name in zip(photos, short_names, strict=True):
         key = short_name.casefold()
         name = short_name if counts[key] == 1 and key not in taken else photo.name
