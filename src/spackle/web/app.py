@@ -752,9 +752,7 @@ class SharedScenes:
         """The link of a finished scene: it shows the scene to whoever has it, and nothing else."""
         self.handlers.find_finished(id)
         path = self.links.path_of(id, caption)
-        if path is None:
-            return SceneLink(path=None)
-        return SceneLink(path=f"{self.handlers.public_path}{outer_root(request.scope)}{path}")
+        return SceneLink(path=None if path is None else f"{self._root(request)}{path}")
 
     async def get_page(
         self, id: str, key: str, request: Request, caption: PageCaption = ""
@@ -767,15 +765,19 @@ class SharedScenes:
         # Programs that show previews of links fetch the picture by its full address.
         host = request.headers["host"]
         origin = self.public_origin or f"{request.url.scheme}://{host}"
-        root = f"{self.handlers.public_path}{outer_root(request.scope)}"
-        plain_key = self.links.key_of(id)
-        preview = f"{origin}{root}{SHARED_PATH}/{id}/{plain_key}/{PREVIEW}"
+        preview = f"{origin}{self._root(request)}{self.links.path_of(id)}{PREVIEW}"
         return HTMLResponse(with_tags(page, caption, preview), headers=SHARED_HEADERS)
 
     async def get_preview(self, id: str, key: str) -> FileResponse:
         """The small photo of a scene, for previews of its link."""
         job = self._find(id, key, "")
         return FileResponse(own_file(job, PREVIEW), media_type=MEDIA_TYPES[".jpg"])
+
+    def _root(self, request: Request) -> str:
+        """What stands before the paths of links in an address: the part that a proxy takes away,
+        and the place where another app has mounted this one.
+        """
+        return f"{self.handlers.public_path}{outer_root(request.scope)}"
 
     def _find(self, id: str, key: str, caption: str) -> Job:
         """The finished job that a link leads to; HTTPException 404 for a link that is none."""

@@ -181,9 +181,10 @@ class Job(SceneState):
 class FileOrder:
     """A file of a finished scene that is being made, and how many clients wait for it."""
 
-    def __init__(self, order: Order) -> None:
-        """Nobody waits yet for the file of `order`."""
+    def __init__(self, order: Order, file: str) -> None:
+        """Nobody waits yet for the file of this name, which `order` makes."""
         self.order = order
+        self.file = file
         self.share: float | None = None  # that is done, 0..1
         self.waiting_clients = 0
 
@@ -480,11 +481,7 @@ class Jobs:
             with self._lock:
                 file_order.waiting_clients -= 1
                 if not file_order.waiting_clients and not file_order.order.outcome.done():
-                    timer = threading.Timer(
-                        ABANDONED_AFTER_S, self._give_up_if_unwanted, [file_order]
-                    )
-                    timer.daemon = True
-                    timer.start()
+                    call_later(ABANDONED_AFTER_S, self._give_up_if_unwanted, file_order)
 
     def _order_file(self, job: Job, file: str, is_video: bool) -> FileOrder:
         """Order a file that nobody has ordered yet; the caller holds the lock."""
@@ -500,7 +497,7 @@ class Jobs:
 
         # It cannot begin, and report, before `file_order` exists, but this name is looked up then.
         with lane.lock:
-            file_order = FileOrder(lane.submit(job.id, add_file))
+            file_order = FileOrder(lane.submit(job.id, add_file), file)
         key = (job.id, file)
         self._file_orders[key] = file_order
         file_order.order.outcome.add_done_callback(lambda outcome: self._forget_file(file_order))
@@ -508,10 +505,11 @@ class Jobs:
 
     def _forget_file(self, file_order: FileOrder) -> None:
         """Note that a file is not being made any more: who asks for it from now on orders it."""
-        # Without the lock, because a lane that holds its own lock may call this.
-        for key, each in list(self._file_orders.items()):
-            if each is file_order:
-                self._file_orders.pop(key, None)
+        key = (file_order.order.owner, file_order.file)
+        # Without the lock, because a lane that holds its own lock may call this. The file may have
+        # been ordered again.
+        if self._file_orders.get(key) is file_order:
+            self._file_orders.pop(key, None)
 
     def _give_up_if_unwanted(self, file_order: FileOrder) -> None:
         """End the work on a file that nobody waits for."""
@@ -630,9 +628,7 @@ class Jobs:
         LOG.error("error: %s: %s: kept, and tried again", job.name, reason)
         line = without_folders(f"the server cannot go on now ({reason}): it will try again")
         self._change(id, state="queued", stage=None, share=None, line=line, attempts=0)
-        timer = threading.Timer(RETRY_S, self._enqueue, [id, line])
-        timer.daemon = True
-        timer.start()
+        call_later(RETRY_S, self._enqueue, id, line)
 
     def _note_event(self, id: str, event: TaskEvent) -> None:
         """Note in a job's state what its process reports: {line}, or a `StageProgress`."""
@@ -710,6 +706,13 @@ def error_line(name: str, failure: TaskFailure) -> str:
     line = without_folders(failure.line)
     # Other lines name the photo already, or blame the server.
     return f"{name}: {line}" if failure.kind in ("time", "memory") else line
+
+
+def call_later(seconds: float, function: Callable[..., None], *arguments: object) -> None:
+    """Call a function after some seconds in a thread of its own, unless the program ends before."""
+    timer = threading.Timer(seconds, function, arguments)
+    timer.daemon = True
+    timer.start()
 
 
 def ignore_event(event: TaskEvent) -> None:

@@ -31,7 +31,7 @@ class SceneLinks:
 
     def path_of(self, scene_id: str, caption: str = "") -> str | None:
         """The path of a scene's page with a caption, or None without a token."""
-        key = self.key_of(scene_id, caption)
+        key = self._key_of(scene_id, caption)
         if key is None:
             return None
         query = f"?caption={quote(caption)}" if caption else ""
@@ -39,10 +39,10 @@ class SceneLinks:
 
     def is_genuine(self, scene_id: str, key: str, caption: str) -> bool:
         """Whether `path_of` has made a link with this key, to this scene and with this caption."""
-        expected = self.key_of(scene_id, caption)
+        expected = self._key_of(scene_id, caption)
         return expected is not None and hmac.compare_digest(expected.encode(), key.encode())
 
-    def key_of(self, scene_id: str, caption: str = "") -> str | None:
+    def _key_of(self, scene_id: str, caption: str) -> str | None:
         """What only somebody with the token can compute of a scene's id and a caption."""
         if self.token is None:
             return None
