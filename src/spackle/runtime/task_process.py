@@ -68,11 +68,17 @@ def machine_fault(error: BaseException | None) -> OSError | None:
 
     None if this machine has no part in it. `error` may be an InputError that was raised from it.
     """
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in MACHINE_ERRORS:
-            return error
-        error = error.__cause__ or error.__context__
+    for cause in _causes(error):
+        if isinstance(cause, OSError) and cause.errno in MACHINE_ERRORS:
+            return cause
     return None
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an exception, the one that it was raised from, and so on."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def import_ahead(module: str) -> None:
@@ -207,11 +213,8 @@ def _failure_of(error: Exception) -> TaskFailure:
     fault = machine_fault(error)
     if fault is not None:
         return TaskFailure("machine", reason_in_a_line(fault))
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, MemoryError):
-            return TaskFailure("memory", "needs more memory than it may take")
-        cause = cause.__cause__ or cause.__context__
+    if any(isinstance(cause, MemoryError) for cause in _causes(error)):
+        return TaskFailure("memory", "needs more memory than it may take")
     if isinstance(error, InputError):
         return TaskFailure("input", " ".join(str(error).split()))
     traceback.print_exception(error)
