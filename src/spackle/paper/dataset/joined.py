@@ -6,6 +6,7 @@ Read `JoinedDataset` first.
 from __future__ import annotations
 
 import bisect
+import functools
 import glob
 import itertools
 import os
@@ -68,7 +69,7 @@ class JoinedDataset(Dataset[PhotoGroup]):
         part_number = bisect.bisect_right(self.starts, index) - 1
         return self.parts[part_number][index - self.starts[part_number]]
 
-    @property
+    @functools.cached_property
     def samples(self) -> list[SampleEntry]:
         """What the manifests say of the photos, in the order of their indices."""
         return [sample for part in self.parts for _, sample in part.samples]

@@ -134,13 +134,4 @@ def check_config(content: dict[str, Any]) -> None:
 
 def read_row(line: str) -> Measurement:
     """The measurement of a line of rows.jsonl; ValueError if it is none."""
-    row = StoredRow.model_validate_json(line)
-    return Measurement(
-        dataset=row.dataset,
-        image=row.image,
-        setting=row.setting,
-        view=row.view,
-        method=row.method,
-        metric=row.metric,
-        value=row.value,
-    )
+    return Measurement(**StoredRow.model_validate_json(line).model_dump())

@@ -10,7 +10,7 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -352,8 +352,8 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
     ):
         with safe_open(path, framework="pt") as file:
             stored_tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            digest = _stated_digest(file)
         # Files of older versions have no digest.
-        digest = sample_digest(path)
         if digest is not None and digest != tree_digest(stored_tensors):
             raise ValueError("its digest is another one")
         tensors = {name: _to_float(name, tensor) for name, tensor in stored_tensors.items()}
@@ -390,7 +390,12 @@ def sample_digest(path: str | os.PathLike[str]) -> str | None:
         Exception: the file is missing or broken.
     """
     with safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
+        return _stated_digest(file)
+
+
+def _stated_digest(file: Any) -> str | None:
+    """The digest that an open safetensors file states; None if it states none."""
+    metadata: dict[str, str] | None = file.metadata()
     return None if metadata is None else metadata.get(DIGEST_KEY)
 
 
