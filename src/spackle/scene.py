@@ -316,13 +316,13 @@ class Scene:
         # A page is made of a scene with base and aux apart, not of the content of a file, so its
         # encoder is added to those of the other formats.
         encode = encoder_for(name, {".html": encode_page})
-        content = SceneFile(
-            path=name,
-            gaussians=self.gaussians,
-            camera=self.camera,
-            base_count=len(self.base),
-            disparity=self.disparity,
+        content = SceneFile.of_scene(
+            name,
+            self.base,
+            self.aux,
+            self.camera,
             is_metric=self.is_metric,
+            disparity=self.disparity,
         )
         return encode(content)
 

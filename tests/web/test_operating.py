@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers.command import run
 from helpers.web_client import PHOTO, SCENES, Served, eventually, form, served
 
 import spackle
@@ -70,6 +71,19 @@ def test_a_photo_that_takes_too_long_fails_and_the_next_one_begins(tmp_path: Pat
         assert slow["error"] == "slow.png: took longer than 1 seconds, the limit"
         server.jobs.limits = RetentionLimits(work_s=60)
         assert server.events(server.send().json["id"])[-1]["state"] == "done"
+
+
+def test_the_command_without_options_has_the_limits_of_python(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limits: list[RetentionLimits] = []
+
+    def note_limits(*arguments: object) -> None:
+        limits.extend(value for value in arguments if isinstance(value, RetentionLimits))
+
+    monkeypatch.setattr("spackle.web.local_server.serve_programs", note_limits)
+    run("serve")
+    assert limits == [RetentionLimits()]
 
 
 def test_all_scenes_are_listed_in_pages_the_newest_first(tmp_path: Path) -> None:

@@ -73,6 +73,35 @@ class SceneFile:
     notes: tuple[str, ...] = ()
     byte_count: int = 0  # of the file, or of all files of the scene
 
+    @staticmethod
+    def of_scene(
+        path: Path,
+        base: Gaussians,
+        aux: Gaussians,
+        camera: Camera,
+        *,
+        is_metric: bool,
+        disparity: float | None = None,
+    ) -> SceneFile:
+        """The content of a file for a completed scene.
+
+        Args:
+            path: the name of the file, or that of the photo, which gives the scene its name.
+            base: the Gaussians of the photo, or of several.
+            aux: those that fill holes.
+            camera: of the photo, or of the most central one.
+            is_metric: whether the unit of length is known to be the metre.
+            disparity: how far to the side the camera may go, see the field.
+        """
+        return SceneFile(
+            path=path,
+            gaussians=Gaussians.cat([base, aux]),
+            camera=camera,
+            base_count=len(base),
+            disparity=disparity,
+            is_metric=is_metric,
+        )
+
     @property
     def losses(self) -> list[str]:
         """What was left out or assumed when the file was read, each in a few words."""

@@ -105,12 +105,9 @@ class PosedScene:
         Raises:
             InputError: the format is not known, or the file cannot be written.
         """
-        content = SceneFile(
-            path=self.photos[0].file.path,  # gives the scene its name
-            gaussians=self.gaussians,
-            camera=self.camera,
-            base_count=len(self.base),
-            is_metric=self.is_metric,
+        photo_path = self.photos[0].file.path  # gives the scene its name
+        content = SceneFile.of_scene(
+            photo_path, self.base, self.aux, self.camera, is_metric=self.is_metric
         )
         write_atomic(path, encoder_for(Path(path), PAGE_ENCODERS)(content))
 

@@ -55,7 +55,6 @@ DECODER_COUNT = 2  # photos that are decoded at a time: a large one takes a giga
 # A photo of 100 megapixels takes a fifth of this time, and a third of this memory. The time by the
 # clock is for a decoder that waits for something.
 DECODING_LIMITS = TaskLimits(seconds=120, cpu_seconds=20, memory_bytes=4_000_000_000)
-FILE_LIMIT_S = 3600.0  # seconds that a file of a finished scene may take, if nothing else is said
 # Seconds after which a file is given up that nobody waits for any more. A proxy that has lost its
 # patience, or a client that has lost its connection, asks again at once.
 ABANDONED_AFTER_S = 5.0
@@ -67,7 +66,7 @@ class RetentionLimits(NamedTuple):
     seconds: float = 7 * 86400.0  # since a job ended: a week
     size: float = 20e9  # bytes
     waiting: int = 32  # jobs in the queue
-    work_s: float | None = None  # seconds that the work on a photo may take; None: any time
+    work_s: float = 3600.0  # that the work on a photo, or on a file of its scene, may take
 
 
 JobState = Literal["queued", "running", "done", "failed"]
@@ -490,7 +489,7 @@ class Jobs:
             raise full_queue("files")
         if job.id not in self.by_id:  # it has been deleted in this moment
             raise HTTPException(404, "there is no such scene")
-        limits = TaskLimits(seconds=self.limits.work_s or FILE_LIMIT_S)
+        limits = TaskLimits(seconds=self.limits.work_s)
 
         def add_file(order: Order) -> TaskFailure | None:
             return order.do((job, file), lambda event: file_order.note_event(event), limits)

@@ -10,7 +10,8 @@ import torch
 from helpers.command import run
 from helpers.dataset_builds import VIEWS, build
 
-from spackle.paper.dataset import DatasetFiles
+from spackle.paper.dataset import DatasetFiles, sample
+from spackle.paper.dataset.encoding import decode_mask
 from spackle.paper.dataset.sample import DatasetView
 from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.residual import ResidualTask
@@ -52,6 +53,20 @@ def test_each_view_has_the_bits_of_a_whole_dataset(lean: Path, whole: Path) -> N
             assert_same_view(lean_group.view(number), full_group.view(number))
     done = run("dataset", "preview", lean, "-o", lean.parent / "look", "--photos", 1)
     assert done.code == 0, done.err
+
+
+def test_a_view_decodes_each_of_its_pictures_once(
+    lean: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[bytes] = []
+
+    def counted(content: bytes) -> torch.Tensor:
+        decoded.append(content)
+        return decode_mask(content)
+
+    monkeypatch.setattr(sample, "decode_mask", counted)
+    DatasetFiles(lean)[0].view(1)
+    assert len(decoded) == 1
 
 
 def assert_same_view(one: DatasetView, other: DatasetView) -> None:

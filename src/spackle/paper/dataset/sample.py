@@ -193,7 +193,7 @@ class PhotoGroup:
                 camera=camera,
                 rendering=rendering,
                 mask=mask,
-                target=self.target(index, rendering.rgb),
+                target=self.target(index, rendering.rgb, mask),
             )
             check_sizes(view)
             return view
@@ -215,13 +215,14 @@ class PhotoGroup:
         with as_input_error(f"{self.where}: view {index}", "cannot be read: {reason}"):
             return camera_from_json(self.facts["views"][index], self.where)
 
-    def target(self, index: int, rendered_rgb: Tensor) -> Tensor:
+    def target(self, index: int, rendered_rgb: Tensor, mask: Tensor | None = None) -> Tensor:
         """[H, W, 3] sRGB that a view should show; InputError if a file is missing or damaged.
 
         Args:
             index: the view's number.
             rendered_rgb: [H, W, 3] sRGB of the view without completion. It is the target outside
                 of the holes, if only the holes are stored.
+            mask: [H, W] bool: the view's holes, where they are decoded already.
         """
         with as_input_error(f"{self.where}: view {index}", "cannot be read: {reason}"):
             target = decode_rgb(self._picture(index, "target"))
@@ -229,7 +230,8 @@ class PhotoGroup:
                 raise ValueError("the target has another size than the view")
             if self.has_renderings:
                 return target
-            mask = decode_mask(self._picture(index, "mask"))
+            if mask is None:
+                mask = decode_mask(self._picture(index, "mask"))
             # Rounded as a stored target is, so that both kinds of datasets teach the same.
             rounded_rgb = to_uint8(rendered_rgb).float().cpu() / 255
             return torch.where(mask[..., None], target, rounded_rgb)
