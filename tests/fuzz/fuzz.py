@@ -2,8 +2,8 @@
 CASE.json`.
 
 A reader's name and a case's number determine the case. A reader may raise `InputError` and nothing
-else, within 10 s of the processor and 1.5 GB. Cases run in forked processes of bounded memory; after a failed case a
-new process continues.
+else, within 10 s of the processor and 1.5 GB. Cases run in forked processes of bounded memory;
+after a failed case a new process continues.
 """
 
 from __future__ import annotations

@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,9 +20,11 @@ from spackle.runtime.errors import InputError
 from spackle.runtime.lanes import Lane
 from spackle.runtime.task_process import (
     CANCELLED,
+    STARTS_QUICKLY,
     WORKER_DIED,
     TaskFailure,
     TaskLimits,
+    TaskProcess,
     machine_fault,
 )
 
@@ -97,6 +102,61 @@ def test_a_closed_lane_takes_no_order() -> None:
     lane = Lane(work, 1)
     lane.close()
     assert outcome(lane, "nothing") == CANCELLED
+
+
+CLOSE_WHILE_THE_FIRST_PROCESS_STARTS = """
+import os, sys, time
+from helpers.lane_work import work
+from spackle.runtime.lanes import Lane
+from spackle.runtime.task_process import import_ahead
+
+import_ahead("helpers.endless_import")
+lane = Lane(work, 1)
+lane.prepare()
+order = lane.submit("a", lambda order: order.do(("nothing", 0), dict))
+if sys.argv[1] != "at once":
+    while not os.path.exists(sys.argv[1]):
+        time.sleep(0.01)
+lane.close()
+print(order.outcome.result().kind)
+"""
+
+
+@pytest.mark.skipif(not STARTS_QUICKLY, reason="processes are not forked from a server here")
+@pytest.mark.parametrize("moment", ["at once", "later"])
+def test_a_lane_is_closed_at_once_while_the_first_process_starts(
+    tmp_path: Path, moment: str
+) -> None:
+    mark = tmp_path / "imports"
+    argument = moment if moment == "at once" else str(mark)
+    # The output ends when the last process has closed it: none is left behind.
+    done = subprocess.run(
+        [sys.executable, "-c", CLOSE_WHILE_THE_FIRST_PROCESS_STARTS, argument],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "SPACKLE_TEST": str(mark)},
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=120,
+    )
+    assert (done.stdout, done.returncode) == ("cancelled\n", 0)
+
+
+def test_a_process_that_cannot_be_started_is_tried_again_and_no_photo_is_blamed(
+    lane: Lane, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusals: list[Exception] = [EOFError("unexpected EOF")]
+
+    def start(*arguments: Any) -> TaskProcess:
+        if refusals:
+            raise refusals.pop()
+        return TaskProcess(*arguments)
+
+    monkeypatch.setattr("spackle.runtime.lanes.TaskProcess", start)
+    assert outcome(lane, "die") == TaskFailure("died", WORKER_DIED)
+    refusals += 2 * [OSError(errno.EAGAIN, "Try again later")]
+    assert outcome(lane, "nothing") == TaskFailure(
+        "machine", "no worker process can be started: Try again later"
+    )
+    assert outcome(lane, "nothing") is None
 
 
 def test_a_full_disk_is_found_behind_other_errors() -> None:

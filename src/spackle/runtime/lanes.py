@@ -5,11 +5,14 @@ A server has several lanes, so that short work does not wait behind long work.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
+from spackle.runtime.errors import reason_in_a_line
 from spackle.runtime.task_process import (
     CANCELLED,
     NO_LIMITS,
@@ -19,7 +22,10 @@ from spackle.runtime.task_process import (
     TaskFunction,
     TaskLimits,
     TaskProcess,
+    end_server_that_imports,
 )
+
+CLOSE_POLL_S = 0.02  # seconds between two attempts to end a start that a closed lane waits for
 
 
 @dataclasses.dataclass(eq=False)
@@ -47,7 +53,13 @@ class Order:
             on_event: called with each event that the function sends.
             limits: what the task may take.
         """
-        process = self.lane.take_process()
+        try:
+            process = self.lane.take_process()
+        except (OSError, EOFError) as error:  # too many processes, or too little memory
+            reason = reason_in_a_line(error)
+            return TaskFailure("machine", f"no worker process can be started: {reason}")
+        if process is None:
+            return CANCELLED
         with self.lane.lock:
             self.process = process
         try:
@@ -92,6 +104,7 @@ class Lane:
         self._waiting: list[Order] = []  # the next one first
         self._running: set[Order] = set()
         self._idle: list[TaskProcess] = []
+        self._starting_count = 0  # processes that are being started
         self._free_gpu_numbers = list(gpu_numbers)
         self._gpu_number_of: dict[TaskProcess, int | None] = {}  # of the processes that run
 
@@ -108,7 +121,15 @@ class Lane:
 
     def prepare(self) -> None:
         """Start a process before there is work; returns at once."""
-        self.submit("", lambda order: self.give_back(self.take_process()))
+
+        def start_process(order: Order) -> None:
+            """Start a process, unless the lane is closed; who gives work is told of an error."""
+            with contextlib.suppress(OSError, EOFError):
+                process = self.take_process()
+                if process is not None:
+                    self.give_back(process)
+
+        self.submit("", start_process)
 
     @property
     def waiting_count(self) -> int:
@@ -157,6 +178,10 @@ class Lane:
             self.cancel(order)
         for process in idle:
             process.kill()
+        # The first process of all takes seconds to start, which nobody wants to wait for any more.
+        while self._starting_count:
+            end_server_that_imports()
+            time.sleep(CLOSE_POLL_S)
         self._threads.shutdown()
 
     def _run_next(self) -> None:
@@ -175,20 +200,46 @@ class Lane:
             with self.lock:
                 self._running.discard(order)
 
-    def take_process(self) -> TaskProcess:
-        """A process that nobody else has; a new one if none is idle."""
+    def take_process(self) -> TaskProcess | None:
+        """A process that nobody else has; a new one if none is idle; None if the lane is closed.
+
+        Raises:
+            OSError, EOFError: no process can be started.
+        """
         with self.lock:
             while self._idle:
                 process = self._idle.pop()
                 if process.alive:
                     return process
                 self._forget(process)
+            if self.is_closed:
+                return None
             gpu_number = self._free_gpu_numbers.pop(0) if self._free_gpu_numbers else None
+            self._starting_count += 1
+
         # Not under the lock: the first one of all takes seconds.
-        process = TaskProcess(self._work, gpu_number)
-        with self.lock:
-            self._gpu_number_of[process] = gpu_number
-        return process
+        new_process = None
+        try:
+            new_process = self._start_process(gpu_number)
+            return new_process
+        finally:
+            with self.lock:
+                self._starting_count -= 1
+                if new_process is not None:
+                    self._gpu_number_of[new_process] = gpu_number
+                elif gpu_number is not None:
+                    self._free_gpu_numbers.append(gpu_number)
+
+    def _start_process(self, gpu_number: int | None) -> TaskProcess | None:
+        """A new process; None if the lane is closed meanwhile; OSError, EOFError if it fails."""
+        try:
+            return TaskProcess(self._work, gpu_number)
+        except (OSError, EOFError):
+            if self.is_closed:
+                return None
+            # Somebody has ended the server that forks processes, another lane that was closed or a
+            # system without memory. Another server is started now.
+            return TaskProcess(self._work, gpu_number)
 
     def give_back(self, process: TaskProcess) -> None:
         """Keep a process for the next task, or end it."""

@@ -40,6 +40,8 @@ SIZE_FILE = Path("/proc/self/statm")
 # Only on Linux, a process can be forked from a small server that has all modules imported already,
 # which takes 0.1 seconds in place of 5. Elsewhere that server, or its libraries, may not be forked.
 STARTS_QUICKLY = sys.platform.startswith("linux")
+# Set when the first process has been forked from that server.
+_has_forked = threading.Event()
 
 
 class TaskLimits(NamedTuple):
@@ -90,6 +92,24 @@ def import_ahead(module: str) -> None:
         multiprocessing.get_context("forkserver").set_forkserver_preload([module])
 
 
+def end_server_that_imports() -> None:
+    """End the server that forks processes if it has forked none yet, because it still imports.
+
+    Who waits for that first process gets an EOFError or an OSError, in place of seconds later a
+    process. The next start of a process starts another server.
+    """
+    if not STARTS_QUICKLY or _has_forked.is_set():
+        return
+    from multiprocessing import forkserver
+
+    # Python offers no way to end it that does not wait for the end of its imports.
+    server = getattr(forkserver, "_forkserver", None)
+    pid = getattr(server, "_forkserver_pid", None)
+    if pid is not None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
 def process_context() -> Any:
     """The way in which processes start here, a context of `multiprocessing`.
 
@@ -108,6 +128,9 @@ class TaskProcess:
             work: does a task.
             gpu_number: number of the GPU on which the process computes, modulo the number of this
                 machine's GPUs; None: the GPU that torch uses by default.
+
+        Raises:
+            OSError, EOFError: no process can be started.
         """
         context = process_context()
         self._pipe, worker_pipe = context.Pipe()
@@ -116,9 +139,16 @@ class TaskProcess:
         self._process = context.Process(
             target=_serve, args=(worker_pipe, work, gpu_number, environment), daemon=True
         )
-        self._process.start()
-        # Only the worker may hold its end, so that the pipe breaks when the worker dies.
-        worker_pipe.close()
+        try:
+            self._process.start()
+        except BaseException:
+            self._pipe.close()
+            raise
+        finally:
+            # Only the worker may hold its end, so that the pipe breaks when the worker dies.
+            worker_pipe.close()
+        if STARTS_QUICKLY:
+            _has_forked.set()
 
     @property
     def alive(self) -> bool:
