@@ -20,8 +20,7 @@ from spackle.bases.transformers import HfBase
 from spackle.core.photo import Photo
 from spackle.formats import PlyFile
 from spackle.paper.dataset.shards import load_manifest
-from spackle.runtime.device import NotEnoughMemory
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, NotEnoughMemory
 from spackle.runtime.progress import Progress
 
 

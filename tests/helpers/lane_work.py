@@ -7,7 +7,7 @@ import os
 import threading
 from typing import Any
 
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, NotEnoughMemory
 
 
 def work(task: Any, send_event: Any) -> None:
@@ -27,5 +27,12 @@ def work(task: Any, send_event: Any) -> None:
         raise InputError("a.png: no\nphoto")
     if kind == "disk":
         raise InputError("a.png: cannot write") from OSError(errno.ENOSPC, "No space left")
+    if kind == "torch":
+        raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory")
+    if kind == "network":
+        try:
+            raise RuntimeError("CUDA out of memory")
+        except RuntimeError as error:
+            raise NotEnoughMemory("not enough memory: give a smaller model") from error
     if kind == "bug":
         raise KeyError(value)

@@ -23,8 +23,7 @@ from spackle.render.gsplat_backend import (
     upper_covariances,
 )
 from spackle.render.protocol import ALPHA_MAX, Rendering
-from spackle.runtime.device import NotEnoughMemory
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, NotEnoughMemory
 
 CPU = CpuRenderer()
 SCENE = box_before_wall(width=45, height=35, focal=40)

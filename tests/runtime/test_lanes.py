@@ -47,6 +47,10 @@ def test_a_failure_says_whose_fault_it_is(lane: Lane) -> None:
     assert outcome(lane, "disk") == TaskFailure("machine", "No space left")
     assert outcome(lane, "bug", "oh") == TaskFailure("bug", "internal error: KeyError: 'oh'")
     assert outcome(lane, "die") == TaskFailure("died", WORKER_DIED)
+    assert outcome(lane, "torch") == TaskFailure("memory", "needs more memory than it may take")
+    assert outcome(lane, "network") == TaskFailure(
+        "memory", "not enough memory: give a smaller model"
+    )
     assert outcome(lane, "nothing") is None
 
 

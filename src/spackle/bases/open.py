@@ -42,8 +42,7 @@ from spackle.depth.units import (
     DepthKind,
     UnclearDepth,
 )
-from spackle.runtime.device import NotEnoughMemory
-from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.errors import InputError, NotEnoughMemory, as_input_error
 from spackle.runtime.progress import Progress
 
 LOG = logging.getLogger("spackle")

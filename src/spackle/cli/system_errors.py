@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import errno
-import sys
 
-from spackle.runtime.errors import reason_in_a_line
+from spackle.runtime.errors import is_memory_shortage, reason_in_a_line
 
 MEMORY_ADVICE = "close other programs, or give something smaller"
 
@@ -18,15 +17,8 @@ def problem_of_system(error: BaseException) -> str | None:
 
     None for any other exception: it is a fault of Spackle, whose traceback the user can report.
     """
-    if isinstance(error, MemoryError):
+    if is_memory_shortage(error):
         return _memory_problem(error)
-    if isinstance(error, RuntimeError):
-        # Only torch reports a shortage of memory this way. It is not imported for this question.
-        if "torch" not in sys.modules:
-            return None
-        from spackle.runtime.device import is_memory_shortage
-
-        return _memory_problem(error) if is_memory_shortage(error) else None
     if not isinstance(error, OSError):
         return None
 

@@ -18,21 +18,7 @@ import torch
 
 import spackle  # for the version, which is written in this one place; it loads nothing else
 from spackle.runtime.declared_options import Precision as Precision
-from spackle.runtime.errors import InputError, check_name
-
-# Torch reports a shortage of memory also by plain RuntimeErrors, whose messages contain one of
-# these phrases.
-_SHORTAGE_PHRASES = (
-    "DefaultCPUAllocator",
-    "not enough memory",
-    "allocate memory",
-    "out of memory",
-    "_ALLOC_FAILED",
-)
-
-
-class NotEnoughMemory(InputError):
-    """Too little memory was free; a later attempt may succeed."""
+from spackle.runtime.errors import InputError, NotEnoughMemory, check_name, is_memory_shortage
 
 
 def pick_device(device: torch.device | str | None) -> torch.device:
@@ -73,14 +59,6 @@ def use_gpu(number: int | None) -> None:
     """
     if number is not None and torch.cuda.device_count() > 1:
         torch.cuda.set_device(number % torch.cuda.device_count())
-
-
-def is_memory_shortage(error: BaseException) -> bool:
-    """Whether an exception of Python, NumPy or torch means that the memory is too small."""
-    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
-        return True
-    is_known_phrase = any(phrase in str(error) for phrase in _SHORTAGE_PHRASES)
-    return isinstance(error, RuntimeError) and is_known_phrase
 
 
 @contextmanager

@@ -16,6 +16,15 @@ MAX_MESSAGE_LENGTH = 300  # characters of a message that may quote a program's v
 MAX_REASON_LENGTH = 200  # characters of a library's message that ours quotes
 MAX_VALUE_LENGTH = 60  # characters of a value that a message quotes
 
+# Torch reports a shortage of memory by RuntimeErrors, whose messages contain one of these phrases.
+SHORTAGE_PHRASES = (
+    "DefaultCPUAllocator",
+    "not enough memory",
+    "allocate memory",
+    "out of memory",
+    "_ALLOC_FAILED",
+)
+
 _value_repr = reprlib.Repr()
 _value_repr.maxlevel = 2  # of nested lists and dictionaries
 _value_repr.maxstring = MAX_VALUE_LENGTH
@@ -26,8 +35,21 @@ class InputError(ValueError):
     """Bad input from a user; its text is a line that says what is wrong and what to do."""
 
 
+class NotEnoughMemory(InputError):
+    """Too little memory was free; a later attempt may succeed."""
+
+
 class Cancelled(Exception):
     """The end of work that the caller's `cancel` has asked for; nothing half-written is left."""
+
+
+def is_memory_shortage(error: BaseException | None) -> bool:
+    """Whether an exception of Python, NumPy or torch means that the memory is too small."""
+    if isinstance(error, MemoryError):
+        return True
+    # Judged by the text, because those who ask shall not have to load torch.
+    is_known_phrase = any(phrase in str(error) for phrase in SHORTAGE_PHRASES)
+    return isinstance(error, RuntimeError) and is_known_phrase
 
 
 def reason_in_a_line(error: object) -> str:

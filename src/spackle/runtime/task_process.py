@@ -16,7 +16,12 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from spackle.runtime.errors import InputError, reason_in_a_line
+from spackle.runtime.errors import (
+    InputError,
+    NotEnoughMemory,
+    is_memory_shortage,
+    reason_in_a_line,
+)
 
 WORKER_DIED = "the worker process died, probably because memory ran out"
 TaskEvent = Mapping[str, Any]  # what a task reports while it runs, such as its progress
@@ -243,7 +248,9 @@ def _failure_of(error: Exception) -> TaskFailure:
     fault = machine_fault(error)
     if fault is not None:
         return TaskFailure("machine", reason_in_a_line(fault))
-    if any(isinstance(cause, MemoryError) for cause in _causes(error)):
+    if isinstance(error, NotEnoughMemory):
+        return TaskFailure("memory", str(error))  # it says what helps
+    if any(map(is_memory_shortage, _causes(error))):
         return TaskFailure("memory", "needs more memory than it may take")
     if isinstance(error, InputError):
         return TaskFailure("input", " ".join(str(error).split()))
