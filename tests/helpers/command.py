@@ -20,6 +20,7 @@ import av
 import pytest
 
 from spackle import cli
+from spackle.results.results_file import RESULTS_NAME
 
 SHORT = ("--frames", "3")
 FILES = {"scene.ply", "video.mp4", "report.json"}
@@ -74,6 +75,19 @@ def page_of(command: Sequence[object], **options: Any) -> bytes:
 def report_of(folder: Path) -> dict[str, Any]:
     report: dict[str, Any] = json.loads((folder / "report.json").read_text())
     return report
+
+
+def timeless_results(folder: Path) -> list[dict[str, Any]]:
+    """The lines of results.jsonl without times, and without what changes with them."""
+    lines = []
+    for text in (folder / RESULTS_NAME).read_text().splitlines():
+        line = json.loads(text)
+        assert line.pop("seconds") >= 0
+        line.pop("state", None)  # has times of files
+        # The report has times, whose digits count.
+        assert line.get("files", {"report.json": 1000}).pop("report.json") > 0
+        lines.append(line)
+    return lines
 
 
 def names_in(folder: Path) -> set[str]:

@@ -6,6 +6,7 @@ The cluster needs Ray (pip install 'spackle-nvs[ray]'), and is a slow test.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -14,17 +15,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers.command import run
+from helpers.command import run, timeless_results
 from helpers.dataset_builds import write_inputs
 from helpers.evaluation_data import write_boxes
 
 import spackle
 from spackle.cli.options import use_gpu_alone
+from spackle.results.results_file import RESULTS_NAME
 from spackle.runtime.errors import InputError
 from spackle.runtime.ray_workers import RayWorker, Surroundings
+from spackle.runtime.worker_options import WorkerOptions
+from spackle.runtime.workers import parallel_map
 
 PHOTO_COUNT = 5
 WAIT_SECONDS = 240  # for a first result, on a busy machine
@@ -36,7 +41,9 @@ class TwoMachines:
     def __init__(self) -> None:
         from ray.cluster_utils import Cluster
 
-        self.cluster: Any = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+        # The dashboard would be ten processes more.
+        head = {"num_cpus": 1, "include_dashboard": False}
+        self.cluster: Any = Cluster(initialize_head=True, head_node_args=head)
         self.other: Any = self.cluster.add_node(num_cpus=1)
         self.address: str = self.cluster.address
 
@@ -71,6 +78,11 @@ def predict_words(place: Path, out: Path) -> Sequence[object]:
 FEW_FRAMES = ("--frames", 3, "--format", "gif", "--threads", 1)  # x264 may encode otherwise
 
 
+def tar_words(place: Path, out: Path) -> Sequence[object]:
+    given = (place / "photos", "--depth", place / "depth", "-o", out)
+    return ("predict", *given, "--no-render", "--tar", 2, "--threads", 1)
+
+
 def dataset_words(place: Path, out: Path) -> Sequence[object]:
     options = ("--base", "rgbd", "--views", 4, "--shard-size", 2, "--threads", 1)
     return ("dataset", "build", place / "photos", "--depth", place / "depth", "-o", out, *options)
@@ -96,14 +108,19 @@ def evaluate_words(place: Path, out: Path) -> Sequence[object]:
 def digests(folder: Path) -> dict[str, str]:
     """SHA-256 of each file of a command's results, by name.
 
-    Reports are left out, because they have times in them, and the hidden file that a worker was
-    writing when it died, which the next run removes.
+    Reports are left out, because they have times in them, and of results.jsonl the times. The
+    hidden file that a worker was writing when it died, and which the next run removes, is left out,
+    too.
     """
     found = {}
     for file in sorted(folder.rglob("[!.]*")):
         name = file.relative_to(folder).as_posix()
-        if file.is_file() and file.name not in ("report.json", "config.json"):
-            found[name] = hashlib.sha256(file.read_bytes()).hexdigest()
+        if not file.is_file() or file.name in ("report.json", "config.json"):
+            continue
+        content = file.read_bytes()
+        if name == RESULTS_NAME:
+            content = json.dumps(timeless_results(folder)).encode()
+        found[name] = hashlib.sha256(content).hexdigest()
     return found
 
 
@@ -123,6 +140,7 @@ def when_first(folder: Path, pattern: str, act: Callable[[], object]) -> threadi
 
 COMMANDS = [
     pytest.param(predict_words, "*/report.json", "*/scene.ply", id="predict"),
+    pytest.param(tar_words, "results-*.tar", "results-*.tar", id="tars"),
     pytest.param(dataset_words, "parts/*.tar", "shard-*.tar", id="dataset"),
     pytest.param(evaluate_words, "images/[0-9]*.json", "images/[0-9]*.json", id="evaluate"),
 ]
@@ -190,6 +208,22 @@ def test_without_ray_the_option_says_what_to_install(
     done = run(*predict_words(place, tmp_path / "out"), "--ray", "local")
     assert done.code == 2
     assert done.lines[-1] == "error: --ray needs Ray: pip install 'spackle-nvs[ray]'"
+
+
+def test_a_cluster_for_one_command_opens_no_dashboard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The dashboard would take jobs from everybody who can reach its port."""
+    words: dict[str, object] = {}
+
+    def init(**given: object) -> None:
+        words.update(given)
+        raise OSError("not here")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
+    workers = WorkerOptions(count=1, threads=1, gpu=False, ray="local")
+    mapped = parallel_map(RayWorker, [1], lambda: False, workers, Path())
+    with pytest.raises(InputError, match="no cluster answers"), mapped:
+        pass
+    assert words["include_dashboard"] is False
 
 
 @pytest.mark.parametrize(

@@ -109,11 +109,14 @@ def _connect(address: str) -> Any:
 
     # Spackle contacts nobody unasked; by default Ray reports to its makers that it was started.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # For a cluster of this command alone no dashboard is started, which would take jobs from
+    # everybody who can reach its port. To a cluster that runs already Ray passes no such option.
+    own_cluster = {"include_dashboard": False} if address == "local" else {}
     # Ray sets a handler for SIGTERM, but the command has its own, which ends it between two jobs.
     in_main_thread = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own_cluster)
     except Exception as error:  # Ray raises errors of many kinds here
         raise InputError(
             f"`ray` {address}: no cluster answers ({reason_in_a_line(error)}): "
