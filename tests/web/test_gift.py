@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,7 +48,8 @@ def box() -> Scene:
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("gift") / "gift.html"
-    path.write_bytes(box().page_file("Our garden.jpg", caption=CAPTION))
+    note = "Rough depth: a quick guess."  # for who made the page, not for who is sent it
+    path.write_bytes(box().page_file("Our garden.jpg", note=note, caption=CAPTION))
     return path
 
 
@@ -72,12 +74,69 @@ def test_the_page_shows_the_picture_and_its_caption_alone(browser: Any, file: Pa
     controls = page.locator("button, input, select, #facts").all()
     visible = [each.get_attribute("id") for each in controls if each.is_visible()]
     assert visible == ["corner"]
+    assert page.locator("#toast.shown").count() == 0
     page.locator("#corner").click()
     assert page.get_by_role("button", name="Save a picture").is_visible()
     assert not page.locator("#caption").is_visible()
     assert not page.locator("#choices").is_visible()  # for photos that a server takes
     page.keyboard.press("Escape")
     assert not page.get_by_role("button", name="Save a picture").is_visible()
+    assert found.said == []
+    page.context.close()
+
+
+# All that a person can read with the tools unfolded: the visible text, the hints, and the names
+# that a screen reader says.
+READABLE = """() => [...document.body.querySelectorAll("*")]
+  .filter((each) => each.checkVisibility() && !each.matches("script, style"))
+  .flatMap((each) => [each.title, each.getAttribute("aria-label"),
+    each.children.length ? "" : each.textContent])
+  .map((text) => text?.trim()).filter(Boolean)"""
+# The pairs of tools, the picture and the corner among them, that cover each other; and the tools
+# that leave the window, or whose text leaves them.
+CROWDED = """() => {
+  const parts = [...document.querySelectorAll("#corner, #bar button, #bar input, #bar")]
+    .filter((each) => each.checkVisibility());
+  const boxes = parts.map((each) => [each, each.getBoundingClientRect()]);
+  const name = (each) => each.textContent.trim() || each.id;
+  const view = document.getElementById("view").getBoundingClientRect();
+  const bar = document.getElementById("bar").getBoundingClientRect();
+  const covers = (a, b) => a.left < b.right && b.left < a.right
+    && a.top < b.bottom && b.top < a.bottom;
+  const crowded = covers(view, bar) ? ["picture"] : [];
+  for (const [each, box] of boxes) {
+    const leaves = box.left < 0 || box.top < 0
+      || box.right > innerWidth || box.bottom > innerHeight;
+    if (leaves || each.scrollWidth > each.clientWidth + 1) crowded.push(name(each));
+    for (const [other, otherBox] of boxes) {
+      const isPart = each === other || each.contains(other) || other.contains(each);
+      if (!isPart && covers(box, otherBox)) crowded.push(`${name(each)} and ${name(other)}`);
+    }
+  }
+  return crowded;
+}"""
+
+
+def test_the_tools_have_plain_words_and_room(browser: Any, file: Path) -> None:
+    found = opened(browser, file.as_uri(), viewport={"width": 1440, "height": 900})
+    page = found.page
+    settled(page, "spackle.ready")
+    page.locator("#corner").click()
+    buttons = [each for each in page.locator("#bar button").all() if each.is_visible()]
+    assert [each.inner_text() for each in buttons] == [
+        "",  # play, which a symbol says
+        *("Side to side", "Sway", "Circle", "Forward"),
+        *("Show what was filled in", "Before and after", "Save a picture", "Save a video"),
+        *("Back to the start", "Full screen"),
+    ]
+    readable = "\n".join(page.evaluate(READABLE))
+    assert "How far it moves" in readable
+    workshop = r"(?i)\b(holes?|added|gaussians?|disparity|layers?|depth|\d+ (cm|m|%))\b|\.jpg"
+    assert re.findall(workshop, readable) == []
+
+    for width, height in ((1440, 900), (1024, 768), (390, 844), (320, 640), (844, 390)):
+        page.set_viewport_size({"width": width, "height": height})
+        eventually(lambda: page.evaluate(CROWDED) == [])
     assert found.said == []
     page.context.close()
 

@@ -240,6 +240,12 @@ def test_every_control_of_a_served_page_has_room(browser: Any, server: Served) -
         page.set_viewport_size({"width": size[0], "height": size[1]})
         unfold(page)
         assert page.evaluate(TOO_LARGE, CONTROLS) == [], size
+
+    # The buttons above the picture choose what is shown.
+    for name in ("What the photo shows", "Both"):
+        button = page.get_by_role("button", name=name, exact=True)
+        button.click()
+        assert button.get_attribute("aria-pressed") == "true"
     page.context.close()
 
 

@@ -6,9 +6,17 @@ const TAP_PIXELS = 12; // a finger that moves farther drags
 const ICONS = '<svg class="close" viewBox="0 0 24 24" aria-hidden="true"><path d="M6.5 6.5l11 11M17.5 6.5l-11 11"/></svg>'
   + '<svg class="sliders" viewBox="0 0 24 24" aria-hidden="true"><path d="M4 7h10M18 7h2M4 17h2M10 17h10"/><circle cx="16" cy="7" r="2.2"/><circle cx="8" cy="17" r="2.2"/></svg>';
 
+// What the tools are called here, for somebody who knows nothing of the program; the ids of their buttons.
+const WORDS = {
+  heat: "Show what was filled in", compare: "Before and after", shot: "Save a picture", record: "Save a video",
+  reset: "Back to the start", full: "Full screen",
+};
+const PATHS = { swipe: "Side to side", shake: "Sway", rotate: "Circle", "rotate-forward": "Forward" };
+
 /** Prepare the page of a file. Its scene is shown afterwards. */
 export function gift(viewer) {
   document.body.classList.add("gift");
+  words();
   backdrop();
   caption();
   corner();
@@ -29,6 +37,22 @@ function backdrop() {
 function caption() {
   const text = document.querySelector('meta[property="og:description"]')?.content;
   if (text) document.getElementById("area").after(Object.assign(document.createElement("p"), { id: "caption", textContent: text }));
+}
+
+/** Whether this is a page that somebody was sent, who need not know the program's words. */
+export function isGift() {
+  return document.body.classList.contains("gift");
+}
+
+/** Plain words on the tools, which are also what a screen reader says. */
+function words() {
+  for (const [id, text] of Object.entries(WORDS)) {
+    const button = document.getElementById(id);
+    button.querySelector("span").textContent = text;
+    button.removeAttribute("aria-label");
+  }
+  for (const button of document.getElementById("paths").children) button.textContent = PATHS[button.dataset.kind];
+  document.querySelector("#disparity").previousElementSibling.textContent = "How far it moves";
 }
 
 /** The button that shows the tools, and hides them again. */

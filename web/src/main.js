@@ -2,7 +2,7 @@
 import { offerBetter } from "./better.js";
 import { control } from "./controls.js";
 import { cameraAt, Edits } from "./edits.js";
-import { gift } from "./gift.js";
+import { gift, isGift } from "./gift.js";
 import { divider, fit, name, panel, roomy, unfold } from "./panel.js";
 import { Queue } from "./queue.js";
 import { sharing } from "./share.js";
@@ -59,8 +59,11 @@ async function first() {
   const own = await source.embedded();
   if (own) {
     gift(viewer);
-    const { title } = document; // the file's own, which stays
-    return show(own).then(() => (document.title = title));
+    const { title } = document; // the file's own, which stays: a photo's name without .jpg
+    return show(own).then(() => {
+      document.title = title;
+      viewer.canvas.setAttribute("aria-label", title);
+    });
   }
   ({ upload } = await source.current());
   element("open").hidden = !upload;
@@ -116,7 +119,7 @@ async function show({ description, layers }, id = null) {
   element("notice").hidden = true;
   element("download").hidden = !id;
   await edits.shown(id);
-  if (description.note) say(description.note);
+  if (description.note && !isGift()) say(description.note);
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
 }
 

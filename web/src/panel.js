@@ -1,11 +1,12 @@
 // The bar below the picture, what stands beside it, and the size of the picture.
+import { isGift } from "./gift.js";
 import { recorder, saveFile, savePicture } from "./save.js";
 
 const ROOM = 230; // pixels beside the picture in which the controls may stay unfolded
 // What is called how, in a scene of a photo and in one that another program made.
 const WORDS = {
-  photo: { base: "What the photo shows", left: "The photo alone", heat: "Holes: what the photo does not show", legend: "not in the photo" },
-  scene: { base: "The scene as it was", left: "As it was", heat: "Holes: where the scene was empty", legend: "empty before" },
+  photo: { base: "What the photo shows", left: "The photo alone", heat: "What the photo does not show", legend: "not in the photo" },
+  scene: { base: "The scene as it was", left: "As it was", heat: "Where the scene was empty", legend: "empty before" },
 };
 const element = (id) => document.getElementById(id);
 
@@ -84,7 +85,8 @@ export function panel(viewer, say) {
     slider.style.setProperty("--at", `${(100 * viewer.disparity) / slider.max}%`);
     const shown = distance(viewer);
     slider.setAttribute("aria-valuetext", shown);
-    slider.parentElement.title = `How far you move to the side: a disparity of ${viewer.disparity.toFixed(2)} (0.3 is large)`;
+    const hint = "How far you move to the side";
+    slider.parentElement.title = isGift() ? hint : `${hint}: a disparity of ${viewer.disparity.toFixed(2)} (0.3 is large)`;
     document.querySelector("output[for=disparity]").value = shown;
   }
 }
