@@ -38,7 +38,6 @@ from torch import Tensor
 from spackle.bases.settings import BaseSettings
 from spackle.core.color import to_uint8
 from spackle.core.photo import load_photo
-from spackle.core.trajectories import DEFAULT_OVERSCAN
 from spackle.pipeline import FillOptions, Pipeline, PipelineOptions
 from spackle.runtime.progress import Reporter
 from spackle.views import PathOptions
@@ -261,7 +260,7 @@ def parser() -> argparse.ArgumentParser:
 
     ends = commands.add_parser("ends")
     ends.add_argument("photos", type=Path, help="a file with a photo's path in each line")
-    ends.add_argument("--overscan", type=float, default=DEFAULT_OVERSCAN)
+    ends.add_argument("--overscan", type=float)
     ends.add_argument("--fill", default="auto")
     ends.add_argument("--disparity", type=float)
     ends.add_argument("--frames", type=int, default=FRAMES, help="of the video, a multiple of 4")

@@ -94,7 +94,6 @@ UNDECLARED = {
 OTHER_DEFAULTS = {
     ("command", "trajectory"): "None, to see whether it was given beside `path`",
     ("python", "fps"): "a plain number, which editors show",
-    ("python", "overscan"): "a plain number, which editors show",
     ("http", "base"): "None is the server's own base",
     ("http", "frames"): "4 seconds, as a plain number",
 }

@@ -12,7 +12,7 @@ from helpers.scenes import box_before_wall
 
 from spackle.core.camera import Camera
 from spackle.core.keyframes import Keyframe, KeyframePath
-from spackle.core.trajectories import DEFAULT_OVERSCAN, TRAJECTORIES, DepthRange, TrajectoryKind
+from spackle.core.trajectories import TRAJECTORIES, DepthRange, TrajectoryKind
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio
 from spackle.scene import Scene
@@ -30,7 +30,7 @@ def filled_scene(path: PathOptions, keyframes: KeyframePath | None = None) -> Fi
     # In smaller pictures, a slit of one pixel would already be more than the largest ratio.
     box = box_before_wall(width=192, height=144, focal=160)
     prediction = dataclasses.replace(box.lift(), max_disparity=DISPARITY)
-    views = plan_views(prediction, path, Path("photo.png"), keyframes=keyframes)
+    views = plan_views(prediction, path, Path("photo.png"), RENDERER, keyframes=keyframes)
     aux = fill_scene(
         FillContext(prediction.gaussians, prediction.camera, RENDERER, None, None),
         [views.cameras[index] for index in views.views_to_fill],
@@ -50,10 +50,10 @@ class FilledPath:
         return max(hole_area_ratio(self.scene.render(view, RENDERER).alpha) for view in cameras)
 
 
-@pytest.mark.parametrize("overscan", [0.0, DEFAULT_OVERSCAN])
+@pytest.mark.parametrize("overscan", [0.0, None])
 @pytest.mark.parametrize("trajectory", TRAJECTORIES)
 def test_every_trajectory_is_filled_where_it_is_reported_and_shown(
-    trajectory: TrajectoryKind, overscan: float
+    trajectory: TrajectoryKind, overscan: float | None
 ) -> None:
     path = PathOptions(trajectory=trajectory, overscan=overscan, video=VideoOptions(fps=15))
     filled = filled_scene(path)
@@ -66,12 +66,12 @@ def test_every_trajectory_is_filled_where_it_is_reported_and_shown(
     # Other viewers show the path through the photo's own lens.
     scene = filled.scene
     depth_range = DepthRange.of(scene.base)
-    own_lens = dataclasses.replace(path, overscan=0.0)
-    wide = own_lens.video_cameras(depth_range, scene.camera, None, DISPARITY)
+    wide = path.video_cameras(depth_range, scene.camera, None, DISPARITY, framing=None)
     assert filled.largest_hole_ratio(wide) <= MAX_HOLE_RATIO
 
     # The video of the saved scene, drawn anew, consists of the planned frames.
-    drawn = path.video_cameras(depth_range, scene.camera, None, DISPARITY)
+    framing = path.choose_framing(scene.base, scene.camera, depth_range, DISPARITY, RENDERER)
+    drawn = path.video_cameras(depth_range, scene.camera, None, DISPARITY, framing)
     for (index,), view in zip(views.frames, drawn, strict=True):
         assert torch.equal(views.cameras[index].world_to_camera, view.world_to_camera)
         assert torch.equal(views.cameras[index].K, view.K)

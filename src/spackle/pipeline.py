@@ -229,7 +229,14 @@ class Pipeline:
         prediction = predicted.prediction
 
         # camera path --> views
-        views = plan_views(prediction, self.options.path, photo.path, given.views, given.keyframes)
+        views = plan_views(
+            prediction,
+            self.options.path,
+            photo.path,
+            self.renderer,
+            given.views,
+            given.keyframes,
+        )
 
         # render --> holes --> fill --> aux
         with reporter.stage("complete") as progress:
@@ -406,15 +413,20 @@ class Pipeline:
         for position, picture in filled.pictures.items():
             index = views.views_to_fill[position]
             frame_index = views.frame_within.get(index, index)
-            pictures[frame_index] = _without_margin(picture, views.cameras[frame_index])
+            pictures[frame_index] = _without_margin(
+                picture, views.cameras[index], views.cameras[frame_index]
+            )
         return FilledHoles(aux=filled.aux, pictures=pictures)
 
 
-def _without_margin(picture: Tensor, camera: Camera) -> Tensor:
-    """The middle [H, W, 3] of a picture, which is all that a camera with H × W pixels shows."""
-    top = (len(picture) - camera.height) // 2
-    left = (picture.shape[1] - camera.width) // 2
-    return picture[top : top + camera.height, left : left + camera.width]
+def _without_margin(picture: Tensor, wide: Camera, frame: Camera) -> Tensor:
+    """The part [H, W, 3] of a wide view's picture that a camera of H × W pixels shows.
+
+    Both cameras look in the same direction with the same focal length, so that their principal
+    points say how their pixels lie to each other.
+    """
+    left, top = (wide.K[:2, 2] - frame.K[:2, 2]).round().int().tolist()
+    return picture[top : top + frame.height, left : left + frame.width]
 
 
 def _fill_each_view(

@@ -21,7 +21,6 @@ from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
 from spackle.core.keyframes import KeyframePath
 from spackle.core.trajectories import (
-    DEFAULT_OVERSCAN,
     DepthRange,
     TrajectoryKind,
     trajectory_cameras,
@@ -338,7 +337,7 @@ class Scene:
         frames: int | None = None,
         fps: float = 30,
         loop: int | None = None,
-        overscan: float = DEFAULT_OVERSCAN,
+        overscan: float | None = None,
         format: str | None = None,
         renderer: Renderer | None = None,
         *,
@@ -363,7 +362,7 @@ class Scene:
             fps: frames per second.
             loop: how often the video is shown; see `spackle.formats.VideoWriter`.
             overscan: relative gain in focal length, which hides most of the fill beyond the
-                photo's border.
+                photo's border; by default it and the camera's target are chosen for the scene.
             format: "mp4", "webm", "gif" or "webp"; by default the path's suffix, or mp4 for an
                 open file.
             renderer: by default the best of this machine, on its GPU if it has one.
@@ -462,13 +461,14 @@ class Scene:
         path = dataclasses.replace(path, video=video)
         path.check()
 
-        cameras = path.video_cameras(
-            self.depth_range, self.camera, keyframes=None, disparity=self.disparity
+        used_renderer = renderer or get_renderer()
+        framing = path.choose_framing(
+            self.base, self.camera, self.depth_range, self.disparity, used_renderer
         )
+        cameras = path.video_cameras(self.depth_range, self.camera, None, self.disparity, framing)
         frame_maker = FrameMaker.of(
             video, self.base, cameras, name_in_messages, is_metric=self.is_metric
         )
-        used_renderer = renderer or get_renderer()
 
         # A frame shows the scene; for a comparison, the base alone to the left of it.
         gaussian_sets = [[self.base, self.aux]]

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from spackle.bases import DEFAULT_MAX_DISPARITY, BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
+from spackle.core.gaussians import Gaussians
 from spackle.core.keyframes import KeyframePath, PathError
 from spackle.core.photo import Photo, working_size
 from spackle.core.trajectories import (
@@ -37,6 +39,7 @@ from spackle.residual.features import hole_area_ratio
 from spackle.runtime.declared_options import MAX_FRAME_COUNT as MAX_FRAME_COUNT
 from spackle.runtime.errors import InputError, as_input_error, check_name
 from spackle.video.frames import SAME_ASPECT_TOLERANCE, FrameMaker
+from spackle.video.framing import SIDEWAYS, Framing, choose_framing
 from spackle.video.options import VideoOptions
 
 DEFAULT_FRAME_COUNT = 60  # cameras of `Scene.path`; of a longer path, 60 to 119 frames are filled
@@ -44,6 +47,7 @@ DEFAULT_VIDEO_SECONDS = 4.0  # duration of a video along a trajectory
 MAX_OVERSCAN = 0.5  # focal length times 1.5, which leaves 44 % of the photo's area
 MAX_REPORTED_KEYFRAMES = 16  # the report measures the holes of at most so many keyframes
 
+NEARLY_NO_PX = 0.01  # by so little, views that show the same may seem to differ
 COARSE_SIDE_PX = 240  # long side of the renderings in which `choose_disparity` measures holes
 DISPARITY_STEP = 0.01  # `choose_disparity` rounds the disparity down to a multiple of this step
 MIN_CHOSEN_DISPARITY = 0.04  # a smaller movement shows no parallax
@@ -65,7 +69,8 @@ class PathOptions:
     frames: int | None = None  # number of video frames; None: `seconds` times the frame rate
     seconds: float | None = None  # duration of the video; None: 4, or the keyframes' duration
     video: VideoOptions = dataclasses.field(default_factory=VideoOptions)
-    overscan: float = DEFAULT_OVERSCAN  # relative gain in focal length along a trajectory
+    # Relative gain in focal length along a trajectory; None: chosen for the photo.
+    overscan: float | None = None
 
     def check(self) -> None:
         """Raise an InputError for an impossible path or video, or for options that contradict."""
@@ -79,7 +84,7 @@ class PathOptions:
                 )
         self._check_length()
         self._check_files()
-        if not 0 <= self.overscan <= MAX_OVERSCAN:
+        if self.overscan is not None and not 0 <= self.overscan <= MAX_OVERSCAN:
             raise InputError(
                 f"`overscan` must be between 0 and {MAX_OVERSCAN:g}, got {self.overscan:g}"
             )
@@ -133,12 +138,42 @@ class PathOptions:
             return round(self.seconds * self.video.frames_per_second)
         return None
 
+    def choose_framing(
+        self,
+        base: Gaussians,
+        camera: Camera,
+        depth_range: DepthRange,
+        disparity: float | None,
+        renderer: Renderer,
+    ) -> Framing:
+        """Where the cameras of the trajectory look, and how much they zoom in.
+
+        The option `overscan` replaces both choices: then the target is the usual one.
+
+        Args:
+            base: the photo's Gaussians.
+            camera: the photo's camera.
+            depth_range: the scene's depths.
+            disparity: size of the camera's movement if the option `disparity` is not given; None:
+                DEFAULT_MAX_DISPARITY.
+            renderer: renders the two widest views.
+        """
+        if self.overscan is not None:
+            return Framing(depth_range.focus, self.overscan)
+        if self.trajectory.replace("_", "-") not in SIDEWAYS:
+            return Framing(depth_range.focus, DEFAULT_OVERSCAN)
+        default_disparity = DEFAULT_MAX_DISPARITY if disparity is None else disparity
+        return choose_framing(
+            base, camera, depth_range, self.disparity_or(default_disparity), renderer
+        )
+
     def video_cameras(
         self,
         depth_range: DepthRange,
         camera: Camera,
         keyframes: KeyframePath | None,
         disparity: float | None,
+        framing: Framing | None,
     ) -> list[Camera]:
         """The cameras of the video's frames, through keyframes or along the trajectory.
 
@@ -150,6 +185,7 @@ class PathOptions:
             keyframes: the keyframes of `path`; None: follow the trajectory.
             disparity: size of the camera's movement if the option `disparity` is not given; None:
                 DEFAULT_MAX_DISPARITY.
+            framing: from `choose_framing`; None: the usual target, and no zoom.
 
         Raises:
             PathError: the keyframes give no usable path.
@@ -167,12 +203,14 @@ class PathOptions:
             self.trajectory,
             camera.even(),
             self.disparity_or(default_disparity),
-            depth_range,
+            depth_range if framing is None else framing.of(depth_range),
             frame_count,
             looped=True,  # most players repeat a video
         )
+        if framing is None:
+            return cameras
         # A little zoom hides most of what the fill has made up beyond the photo's border.
-        return [view.zoomed(1 + self.overscan) for view in cameras]
+        return [view.zoomed(1 + framing.overscan) for view in cameras]
 
     def _keyframe_cameras(
         self, depth_range: DepthRange, camera: Camera, keyframes: KeyframePath
@@ -401,14 +439,51 @@ class PlannedViews:
     frame_maker: FrameMaker  # makes a frame of the video from the renderings of its views
 
 
+class Margin(NamedTuple):
+    """Pixels that are added to a view at its four sides."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @staticmethod
+    def to_show(view: Camera, other: Camera) -> Margin:
+        """The margin with which a view shows all that another view from the same place shows."""
+        other_corners = torch.tensor(
+            [[0, 0], [other.width, 0], [0, other.height], [other.width, other.height]],
+            dtype=torch.float64,
+        )
+        points = other.unproject(other_corners, torch.ones(4, dtype=torch.float64))
+        corners, _ = view.project(points)  # [4, 2] where this view shows the other's corners
+        size = corners.new_tensor([view.width, view.height])
+
+        def whole_pixels(lengths: Tensor) -> list[int]:
+            """Lengths rounded up, but for errors of rounding."""
+            return (lengths - NEARLY_NO_PX).ceil().clamp_min(0).int().tolist()
+
+        left, top = whole_pixels(-corners.amin(0))
+        right, bottom = whole_pixels(corners.amax(0) - size)
+        return Margin(left, top, right, bottom)
+
+    def around(self, view: Camera) -> Camera:
+        """The view with this margin."""
+        return view.cropped(
+            -self.left,
+            -self.top,
+            view.width + self.left + self.right,
+            view.height + self.top + self.bottom,
+        )
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _PathViews:
     """The cameras of a path: what its video shows, and what is filled or reported besides."""
 
     frame_cameras: list[Camera]  # of the video's frames; of a stereo video, midway between the eyes
     filled_frame_step: int = 1  # every first, second, … of these frames is filled
-    # Pixels left and right, above and below, by which filled views are larger than their frames.
-    filled_margin_px: tuple[int, int] = (0, 0)
+    # By how much the filled view of each frame is larger than the frame.
+    filled_margins: list[Margin] = dataclasses.field(default_factory=list)
     reported_cameras: dict[str, Camera] = dataclasses.field(default_factory=dict)  # by name
 
 
@@ -416,6 +491,7 @@ def plan_views(
     prediction: BasePrediction,
     path: PathOptions,
     source: Path,
+    renderer: Renderer,
     given_views: list[Camera] | None = None,
     keyframes: KeyframePath | None = None,
 ) -> PlannedViews:
@@ -429,6 +505,7 @@ def plan_views(
         prediction: the photo's Gaussians and camera.
         path: the options of path and video.
         source: the photo's file, for messages.
+        renderer: renders coarse views, in which the photo's border is found.
         given_views: the views of `path.cameras`, which replace a path.
         keyframes: the keyframes of `path.path`, which replace the trajectory.
 
@@ -445,7 +522,7 @@ def plan_views(
             as_input_error(path.path, "{reason}", PathError),
         ):
             if keyframes is None:
-                path_views = _trajectory_views(prediction, path)
+                path_views = _trajectory_views(prediction, path, renderer)
             else:
                 path_views = _keyframe_views(prediction, path, keyframes)
 
@@ -459,32 +536,41 @@ def plan_views(
     return _index_views(path_views, frame_maker, given_views or [])
 
 
-def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathViews:
+def _trajectory_views(
+    prediction: BasePrediction, path: PathOptions, renderer: Renderer
+) -> _PathViews:
     """The views along a trajectory; the report measures its leftmost and rightmost view.
 
     ValueError if the scene allows no such path.
     """
     depth_range = prediction.depth_range
+    usual_disparity = prediction.max_disparity
+    framing = path.choose_framing(
+        prediction.gaussians, prediction.camera, depth_range, usual_disparity, renderer
+    )
     frame_cameras = path.video_cameras(
-        depth_range, prediction.camera, keyframes=None, disparity=prediction.max_disparity
+        depth_range, prediction.camera, None, usual_disparity, framing
     )
     camera = prediction.camera.even()
     disparity = path.disparity_or(prediction.max_disparity)
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
-    # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other
-    # programs show the scene without this zoom. So frames are filled with a margin around them, of
-    # the width that the zoom has cut off: together they show as much as the photo's own lens.
-    filled_margin_px = (
-        math.ceil(path.overscan * camera.width / 2),
-        math.ceil(path.overscan * camera.height / 2),
+    # The framing of the video hides what lies beyond the photo's border. Other programs show the
+    # scene without it: through the photo's own lens, and with the usual target. So frames are
+    # filled with margins around them, with which they also show this.
+    usual_cameras = path.video_cameras(
+        depth_range, prediction.camera, None, usual_disparity, framing=None
     )
+    filled_margins = [
+        Margin.to_show(frame, usual)
+        for frame, usual in zip(frame_cameras, usual_cameras, strict=True)
+    ]
 
     return _PathViews(
         frame_cameras=frame_cameras,
         # Of a long path every second, third, … frame is filled, so that 60 to 119 frames are.
         filled_frame_step=max(1, len(frame_cameras) // DEFAULT_FRAME_COUNT),
-        filled_margin_px=filled_margin_px,
+        filled_margins=filled_margins,
         reported_cameras={f"-{disparity:g}": leftmost, f"+{disparity:g}": rightmost},
     )
 
@@ -498,7 +584,11 @@ def _keyframe_views(
     PathError if the keyframes give no path; ValueError if the scene allows none.
     """
     frame_cameras = path.video_cameras(
-        prediction.depth_range, prediction.camera, keyframes, prediction.max_disparity
+        prediction.depth_range,
+        prediction.camera,
+        keyframes,
+        prediction.max_disparity,
+        framing=None,
     )
     key_cameras = keyframes.at(
         [key.time for key in keyframes.keys],
@@ -555,14 +645,17 @@ def _index_views(
     views_to_fill = list(range(middle_view_count))
     # A frame that is filled with a margin around it is filled as a larger view of its own.
     frame_within: dict[int, int] = {}
-    for frame in frames[:: path_views.filled_frame_step]:
-        for index in frame:
-            if path_views.filled_margin_px == (0, 0):
+    for frame_index in range(0, len(frames), path_views.filled_frame_step):
+        margin = Margin(0, 0, 0, 0)
+        if path_views.filled_margins:
+            margin = path_views.filled_margins[frame_index]
+        for index in frames[frame_index]:
+            if not any(margin):
                 views_to_fill.append(index)
             else:
                 views_to_fill.append(len(cameras))
                 frame_within[len(cameras)] = index
-                cameras.append(_with_margin(cameras[index], path_views.filled_margin_px))
+                cameras.append(margin.around(cameras[index]))
     views_to_fill.extend(range(frame_view_end, shown_view_count))  # what the report measures
 
     return PlannedViews(
@@ -575,9 +668,3 @@ def _index_views(
         given_view_count=len(given_views),
         frame_maker=frame_maker,
     )
-
-
-def _with_margin(camera: Camera, margin_px: tuple[int, int]) -> Camera:
-    """A view with more pixels on all sides: (left and right, above and below)."""
-    across, down = margin_px
-    return camera.cropped(-across, -down, camera.width + 2 * across, camera.height + 2 * down)

@@ -109,7 +109,8 @@ def test_render_says_where_it_guesses_the_lens(tmp_path: Path, scene: Path) -> N
 
 
 def test_compare_puts_the_base_beside_the_scene(tmp_path: Path, scene: Path) -> None:
-    words = ("--trajectory", "swipe", "--seconds", 0.2, "--fps", 10)
+    # Without overscan, what lies beyond the photo's border is in the frame, too.
+    words = ("--trajectory", "swipe", "--seconds", 0.2, "--fps", 10, "--overscan", 0)
     rendered(scene, tmp_path / "both.webp", "--compare", *words)
     rendered(scene, tmp_path / "whole.webp", *words)
     both, whole = (

@@ -254,7 +254,6 @@ def path_options(
         InputError: an option would have no effect, because --path or --cameras sets the views.
     """
     # Imported here, because the help must not wait for torch.
-    from spackle.core.trajectories import DEFAULT_OVERSCAN
     from spackle.video.options import VideoOptions, parse_size
     from spackle.views import PathOptions
 
@@ -296,5 +295,5 @@ def path_options(
         frames=frames,
         seconds=seconds,
         video=video,
-        overscan=DEFAULT_OVERSCAN if overscan is None else overscan,
+        overscan=overscan,
     )

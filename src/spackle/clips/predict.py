@@ -17,6 +17,7 @@ from spackle.clips.files import Clip, clip_frames, read_clip
 from spackle.clips.writer import ClipWriter
 from spackle.core.focal_length import FocalSource, resolve_focal_length
 from spackle.core.photo import Photo, check_photo_size, resize_photo
+from spackle.core.trajectories import DEFAULT_OVERSCAN
 from spackle.depth.units import RELATIVE_KINDS
 from spackle.inpaint.plain import OpenCV
 from spackle.pipeline import Pipeline, PipelineOptions, describe_movement
@@ -269,6 +270,10 @@ class FramePredictor:
             exif={},  # a video has none
             **lens,
         )
+        # One framing serves all frames of a clip, so it cannot be chosen for one of them.
+        overscan = options.path.overscan
+        if overscan is None:
+            overscan = DEFAULT_OVERSCAN
         self._completer = ClipCompleter(
             trajectory=options.path.trajectory,
             disparity=options.path.disparity,
@@ -279,7 +284,7 @@ class FramePredictor:
             fill=options.fill.texture != "none",  # "none" leaves all holes open
             network=pipeline.network,
             precision=options.base.precision,
-            overscan=options.path.overscan,
+            overscan=overscan,
         )
 
     def completed_views(self) -> Iterator[CompletedView]:

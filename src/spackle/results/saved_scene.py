@@ -261,9 +261,18 @@ def _open_scene_video(
         as_input_error(scene_file, NO_PATH_MESSAGE, ValueError),
         as_input_error(path.path, "{reason}", PathError),
     ):
-        cameras = given.views or path.video_cameras(
-            scene.depth_range, scene.camera, given.keyframes, scene.disparity
-        )
+        cameras = given.views
+        if cameras is None and given.keyframes is None:
+            framing = path.choose_framing(
+                scene.base, scene.camera, scene.depth_range, scene.disparity, renderer
+            )
+            cameras = path.video_cameras(
+                scene.depth_range, scene.camera, None, scene.disparity, framing
+            )
+        elif cameras is None:
+            cameras = path.video_cameras(
+                scene.depth_range, scene.camera, given.keyframes, scene.disparity, framing=None
+            )
 
     _say_if_beyond_completion(scene, scene_file, path, reporter)
     if not given.views and loaded.camera is None and not has_new_lens:

@@ -164,7 +164,7 @@ class DeclaredOptions:
         None,
         "Increase the focal length by this fraction, which hides most of the area beyond the "
         "photo's border.",
-        "0.05; 0 with `path` and `cameras`",
+        "chosen for the photo, 0.03 to 0.08; 0 with `path` and `cameras`",
     )
 
     # The video.
