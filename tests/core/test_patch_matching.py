@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from helpers.plain_patches import Subject
+from helpers.plain_patches import Subject, as_tensors
 from helpers.scenes import psnr
 from torch import Tensor
 
 from spackle.core.patch_matching import NEIGHBOR_STEPS, match_patches
-from spackle.core.patch_search import improve_matches, patch_cost
+from spackle.core.patch_search import improve_match, patch_cost
 
 Y, X = np.indices((100, 117))
 WALL = torch.ones(Y.shape)
@@ -33,9 +33,8 @@ def test_costs_match_the_formula_and_searches_approach_the_minimum(size: tuple[i
         step = NEIGHBOR_STEPS[turn % len(NEIGHBOR_STEPS)]
         before = (places.copy(), costs.copy())
         state = (*before, subject.valid, subject.pool, step, np.uint32(turn * 7919))
-        improve_matches(
-            0, len(costs), cells, subject.numbers, *state, subject.inputs, places, costs
-        )
+        arguments = (cells, subject.numbers, *state, subject.inputs, places, costs)
+        improve_match(len(costs), *map(as_tensors, arguments))
         assert (costs <= before[1]).all()
     np.testing.assert_allclose(costs, subject.expected(), rtol=1e-4)
     assert costs.mean() < 1.06 * np.mean([subject.formula(*cell).min() for cell in cells])

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view as windows
 
 from spackle.core.filters import gaussian_blur
 from spackle.core.patch_matching import _build_pyramid
-from spackle.core.patch_search import PATCH_RADIUS, PATCH_SIDE, CostInputs, score_matches
+from spackle.core.patch_search import PATCH_RADIUS, PATCH_SIDE, CostInputs, score_match
 
 INNER = slice(PATCH_RADIUS, -PATCH_RADIUS)
+
+
+def as_tensors(argument: Any) -> Any:
+    """A kernel's argument with tensors in place of NumPy's arrays, of the same memory."""
+    if isinstance(argument, np.ndarray):
+        return torch.from_numpy(argument)
+    if isinstance(argument, CostInputs):
+        return CostInputs(*map(as_tensors, argument))
+    return argument
 
 
 class Subject:
@@ -23,7 +34,9 @@ class Subject:
         hole = torch.zeros(height, width, dtype=torch.bool)
         hole[height // 3 : height // 2, width // 3 : width // 2] = hole[-height // 5 :, -3:] = True
         z = torch.linspace(-1.5, 0, width) + 0.1 * rgb[..., 0]
-        self.level = _build_pyramid(rgb, hole, z.exp())[0]
+        level = _build_pyramid(rgb, hole, z.exp())[0]
+        self.rgb = level.rgb
+        level_rgb, level_traits = level.rgb.numpy(), level.traits.numpy()
         self.hole, self.cells = hole.numpy(), hole.nonzero().numpy().astype(np.int32)
         self.numbers = np.where(hole, hole.flatten().cumsum(0).view_as(hole) - 1, -1).astype(
             np.int32
@@ -32,14 +45,14 @@ class Subject:
             ~windows(self.hole, (PATCH_SIDE, PATCH_SIDE)).any(axis=(2, 3)), PATCH_RADIUS
         )
         self.pool = np.argwhere(usable).astype(np.int32)
-        grids = (self.level.rgb, self.level.traits, usable)
+        grids = (level_rgb, level_traits, usable)
         self.sources, traits, self.valid = (np.stack([grid, grid[:, ::-1]]) for grid in grids)
-        self.padded = np.pad(self.level.rgb, [(PATCH_RADIUS, PATCH_RADIUS)] * 2 + [(0, 0)])
+        self.padded = np.pad(level_rgb, [(PATCH_RADIUS, PATCH_RADIUS)] * 2 + [(0, 0)])
         step = 0.05 / max(height, width) ** 2
         self.inputs = CostInputs(
             self.padded,
-            self.level.weights,
-            self.level.traits,
+            level.weights.numpy(),
+            level_traits,
             self.sources,
             traits,
             np.float32(step),
@@ -54,7 +67,8 @@ class Subject:
         every = np.argwhere(self.valid).astype(np.int32)
         self.places = every[:: len(every) // len(self.cells)][: len(self.cells)]
         self.costs = np.empty(len(self.cells), np.float32)
-        score_matches(0, len(self.cells), self.cells, self.places, self.inputs, self.costs)
+        arrays = (self.cells, self.places, self.inputs, self.costs)
+        score_match(len(self.cells), *map(as_tensors, arrays))
 
     def formula(self, y: int, x: int) -> np.ndarray:
         """Costs [2, height, width] of all patches and mirrored patches; infinite for patches that

@@ -10,7 +10,7 @@ from pathlib import Path
 USER = """
 import os
 import spackle.runtime.kernels
-spackle.runtime.kernels._FASTMATH = set(os.environ["FLAGS"].split())
+spackle.runtime.kernels.FASTMATH = set(os.environ["FLAGS"].split())
 from number import SIDE
 from helper import doubled
 from spackle.runtime.kernels import kernel

@@ -136,9 +136,9 @@ def test_blocks_are_weighted_means_of_matches() -> None:
     places, costs = np.full((24, 31, 3), -1, np.int32), np.zeros((24, 31), np.float32)
     places[tuple(subject.cells.T)], costs[tuple(subject.cells.T)] = subject.places, subject.costs
     blocks = rng.random((24, 31, 2, 3, 1)).astype(np.float32)
-    grids = [torch.from_numpy(grid) for grid in (subject.level.rgb, np.sqrt(costs), places)]
+    grids = [torch.from_numpy(grid) for grid in (subject.rgb.numpy(), np.sqrt(costs), places)]
     found = room.copy_patch_blocks(Patches(*grids), torch.from_numpy(blocks)).numpy()
-    assert np.array_equal(found[~subject.level.hole], blocks[~subject.level.hole])
+    assert np.array_equal(found[~subject.hole], blocks[~subject.hole])
     sources = (blocks, blocks[:, ::-1, :, ::-1])
     for cell in subject.cells:
         over = np.abs(subject.cells - cell).max(1) <= 1

@@ -6,13 +6,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from spackle.runtime.kernels import kernel
+from spackle.runtime.parallel_kernels import kernel_for_items, kernel_for_pixels
 
 UNREACHABLE_PX = 1 << 14  # distance of a pixel that does not exist; larger than every image
 
@@ -97,55 +95,86 @@ def maximum_filter(image: Tensor, radius: int) -> Tensor:
     return image
 
 
-def nearest_known_pixels(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """For each pixel the row and column [2, H, W] of the nearest pixel outside of a hole [H, W].
+def nearest_known_pixels(hole: Tensor) -> Tensor:
+    """For each pixel the row and column [2, H, W] int32 of the nearest pixel outside of a hole.
 
-    In rare cases the second nearest pixel is returned: only a few sweeps spread the nearest pixels
-    from neighbour to neighbour, which is much faster than an exact search. If the whole image is a
-    hole, all rows and columns are `-UNREACHABLE_PX`.
+    If the whole image is a hole, all rows and columns are `-UNREACHABLE_PX`.
+
+    Args:
+        hole: [H, W] bool, on any device, as is the result.
     """
-    own_positions = np.indices(hole.shape)  # [2, H, W]
-    # A known pixel is its own nearest one; a hole pixel begins with one that is too far away.
-    nearest = np.where(hole, -UNREACHABLE_PX, own_positions).astype(np.int32)
-    _spread_nearest(hole, nearest)
+    hole = hole.contiguous()
+    nearest_in_column = torch.empty(hole.shape, dtype=torch.int32, device=hole.device)
+    _find_nearest_in_columns(hole.shape[1], hole, nearest_in_column)
+    nearest = torch.empty((2, *hole.shape), dtype=torch.int32, device=hole.device)
+    _find_nearest(hole.shape, nearest_in_column, nearest)
     return nearest
 
 
-def distance_to_nearest(nearest: NDArray[np.int32]) -> Tensor:
+def distance_to_nearest(nearest: Tensor) -> Tensor:
     """The distance [H, W] in pixels from each pixel to its nearest known pixel.
 
     `nearest` [2, H, W] holds the row and column of the nearest known pixel of each pixel.
     """
-    own_positions = np.indices(nearest.shape[1:], np.int32)
-    rows_apart, columns_apart = torch.from_numpy(nearest - own_positions).float()
-    return torch.hypot(rows_apart, columns_apart)
+    height, width = nearest.shape[1:]
+    rows_apart = nearest[0] - torch.arange(height, device=nearest.device)[:, None]
+    columns_apart = nearest[1] - torch.arange(width, device=nearest.device)
+    return torch.hypot(rows_apart.float(), columns_apart.float())
 
 
-@kernel
-def _spread_nearest(hole: Any, nearest: Any) -> None:
-    """Give each pixel of a hole a neighbour's nearest known pixel if that is nearer than its own.
-
-    Each sweep visits all pixels. Two sweeps from the first pixel to the last, and two from the last
-    to the first, spread the positions of known pixels in all directions.
+@kernel_for_items
+def _find_nearest_in_columns(column: int, hole: Any, nearest_row: Any) -> None:
+    """Write, for each pixel of a column, the row of the nearest known pixel in the column.
 
     Args:
-        hole: [H, W] bool.
-        nearest: [2, H, W] int32 row and column of the nearest known pixel; improved in place.
+        column: is done.
+        hole: [H, W] bool; pixels outside of it are known.
+        nearest_row: output [H, W] int32; `-UNREACHABLE_PX` if the column has no known pixel.
     """
-    height, width = hole.shape
-    for sweep in range(4):
-        for i in range(height):
-            # Every other sweep runs backwards.
-            y = i if sweep % 2 == 0 else height - 1 - i
-            for j in range(width):
-                x = j if sweep % 2 == 0 else width - 1 - j
-                if not hole[y, x]:
-                    continue
-                # Look at the 3×3 pixels around (y, x).
-                for v in range(max(y - 1, 0), min(y + 2, height)):
-                    for u in range(max(x - 1, 0), min(x + 2, width)):
-                        row, column = nearest[0, v, u], nearest[1, v, u]
-                        own_distance2 = (nearest[0, y, x] - y) ** 2 + (nearest[1, y, x] - x) ** 2
-                        if (row - y) ** 2 + (column - x) ** 2 < own_distance2:
-                            nearest[0, y, x] = row
-                            nearest[1, y, x] = column
+    height = hole.shape[0]
+    last_known = -UNREACHABLE_PX
+    for y in range(height):
+        if not hole[y, column]:
+            last_known = y
+        nearest_row[y, column] = last_known
+
+    # Upwards, the known pixel below may be nearer than the one above.
+    next_known = -UNREACHABLE_PX
+    for i in range(height):
+        y = height - 1 - i
+        if not hole[y, column]:
+            next_known = y
+        is_nearer = next_known - y < y - nearest_row[y, column]
+        if next_known >= 0 and is_nearer:
+            nearest_row[y, column] = next_known
+
+
+@kernel_for_pixels
+def _find_nearest(y: int, x: int, nearest_row: Any, nearest: Any) -> None:
+    """Write the row and column of the known pixel nearest to a pixel.
+
+    Args:
+        y, x: the pixel.
+        nearest_row: [H, W] the row of the nearest known pixel in each pixel's own column.
+        nearest: output [2, H, W] int32; `-UNREACHABLE_PX` if there is no known pixel.
+    """
+    width = nearest_row.shape[1]
+    nearest_y = -UNREACHABLE_PX
+    nearest_x = -UNREACHABLE_PX
+    least_distance2 = UNREACHABLE_PX * UNREACHABLE_PX
+
+    # Look at columns farther and farther away, until the column alone is as far as what was found.
+    for columns_apart in range(width):
+        if columns_apart * columns_apart >= least_distance2:
+            break
+        for column in (x - columns_apart, x + columns_apart):
+            if column < 0 or column >= width:
+                continue
+            row = int(nearest_row[y, column])
+            distance2 = (row - y) * (row - y) + columns_apart * columns_apart
+            if row >= 0 and distance2 < least_distance2:
+                least_distance2 = distance2
+                nearest_y = row
+                nearest_x = column
+    nearest[0, y, x] = nearest_y
+    nearest[1, y, x] = nearest_x

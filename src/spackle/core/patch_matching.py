@@ -17,9 +17,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, pad
 
 from spackle.core.filters import (
     distance_to_nearest,
@@ -30,13 +29,12 @@ from spackle.core.filters import (
 from spackle.core.patch_search import (
     PATCH_RADIUS,
     CostInputs,
-    improve_matches,
-    score_matches,
-    start_matches,
-    vote_colors,
+    improve_match,
+    score_match,
+    start_match,
+    vote_color,
 )
-from spackle.runtime.device import parallel_for_chunks
-from spackle.runtime.kernels import kernel
+from spackle.runtime.parallel_kernels import kernel_for_pixels
 
 MIN_COARSEST_SIDE_PX = 48  # short side of the coarsest level; patches need room around the hole
 SEARCH_ROUNDS = 6  # number of searches and votes at each level
@@ -52,13 +50,9 @@ DISTANCE_WEIGHT = 0.05
 MIN_DEPTH_SPREAD = 0.05  # least σz; the depth of a wall that faces the camera hardly varies
 
 FADING_PER_PX = 0.8  # a pixel's weight in a patch is 0.8^d at a depth of d pixels in the hole
-MIN_PIXEL_WEIGHT = np.float32(1e-30)  # a patch deep in a hole still has a mean
+MIN_PIXEL_WEIGHT = 1e-30  # a patch deep in a hole still has a mean
 SAME_SURFACE_DEPTH = 0.25  # greatest difference in z / σz between a pixel and its mirror image
 MIN_MEAN_COST = 1e-8  # votes divide by the mean cost
-
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int32]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,26 +86,22 @@ def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches
     finest = levels[0]
     # Outside of the hole, a pixel has no patch: −1 marks this. There is no match at all if the
     # picture has no hole, or no patch without a hole pixel.
-    mismatch = np.zeros(hole.shape, np.float32)
-    positions = np.full((*hole.shape, 3), -1, np.int32)
+    mismatch = finest.rgb.new_zeros(hole.shape)
+    positions = finest.rgb.new_full((*hole.shape, 3), -1, dtype=torch.int32)
     if matches is not None:
         positions[finest.hole] = matches.positions
-        mismatch[finest.hole] = np.sqrt(matches.costs)
-    return Patches(
-        rgb=torch.from_numpy(finest.rgb),
-        mismatch=torch.from_numpy(mismatch),
-        matches=torch.from_numpy(positions),
-    )
+        mismatch[finest.hole] = matches.costs.sqrt()
+    return Patches(rgb=finest.rgb, mismatch=mismatch, matches=positions)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Level:
     """One level of the pyramid, h × w pixels."""
 
-    rgb: Floats  # [h, w, 3]; votes change the hole's pixels in place
-    traits: Floats  # [h, w, 4] tone and depth, scaled so that squared differences are costs
-    hole: Bools  # [h, w]
-    weights: Floats  # [h + 6, w + 6] weights of pixels in a patch; 0 beyond the picture
+    rgb: Tensor  # [h, w, 3] float32; votes change the hole's pixels in place
+    traits: Tensor  # [h, w, 4] tone and depth, scaled so that squared differences are costs
+    hole: Tensor  # [h, w] bool
+    weights: Tensor  # [h + 6, w + 6] weights of pixels in a patch; 0 beyond the picture
 
 
 def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
@@ -127,8 +117,9 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
     depth = _relative_log_depth(inverse_depth, hole)  # [H, W, 1]
     tone = guess  # is blurred at each level; unlike `rgb`, it keeps the smooth colours in the hole
     rgb = guess.clone(memory_format=torch.contiguous_format)
-    nearest = nearest_known_pixels(hole.numpy())
-    _mirror_into_hole(rgb.numpy(), hole.numpy(), depth[..., 0].numpy(), nearest)
+    hole = hole.contiguous()
+    nearest = nearest_known_pixels(hole)
+    _mirror_into_hole(hole.shape, rgb, hole, depth[..., 0].contiguous(), nearest)
 
     levels: list[_Level] = []
     while True:
@@ -139,10 +130,10 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
         # centres. These traits are scaled so that their squared differences are costs.
         traits = [TONE_WEIGHT * gaussian_blur(tone, tone_blur), DEPTH_WEIGHT * depth]
         level = _Level(
-            rgb=rgb.contiguous().numpy(),
-            traits=torch.cat(traits, dim=-1).contiguous().numpy(),
-            hole=hole.numpy(),
-            weights=_pixel_weights(hole.numpy()),
+            rgb=rgb.contiguous(),
+            traits=torch.cat(traits, dim=-1).contiguous(),
+            hole=hole,
+            weights=_pixel_weights(hole),
         )
         levels.append(level)
 
@@ -167,17 +158,17 @@ def _relative_log_depth(inverse_depth: Tensor, hole: Tensor) -> Tensor:
     return log_depth / max(spread, MIN_DEPTH_SPREAD)
 
 
-def _pixel_weights(hole: Bools) -> Floats:
+def _pixel_weights(hole: Tensor) -> Tensor:
     """Weights [h + 6, w + 6] of a picture's pixels [h, w] when two patches are compared.
 
     Known pixels have the weight 1. The guess deep in a hole is unreliable, so it counts less:
     0.8^d for a pixel that is d pixels away from the nearest known one. The picture is padded with
     three pixels of weight 0 at each side, because a patch of 7×7 pixels may reach beyond it.
     """
-    distance = distance_to_nearest(nearest_known_pixels(hole)).numpy()
+    distance = distance_to_nearest(nearest_known_pixels(hole))
     # Above zero, because a mean over a patch deep in the hole divides by the sum of the weights.
-    weights = np.maximum(np.float32(FADING_PER_PX) ** distance, MIN_PIXEL_WEIGHT)
-    return np.pad(weights.astype(np.float32, copy=False), PATCH_RADIUS)
+    weights = (FADING_PER_PX**distance).clamp_min(MIN_PIXEL_WEIGHT)
+    return pad(weights, (PATCH_RADIUS,) * 4)
 
 
 def _reduce_by_half(image: Tensor) -> Tensor:
@@ -190,39 +181,39 @@ def _reduce_by_half(image: Tensor) -> Tensor:
     return means.permute(1, 2, 0)
 
 
-@kernel
-def _mirror_into_hole(rgb: Any, hole: Any, depth: Any, nearest: Any) -> None:
-    """Fill each hole pixel, in place, with its mirror image about the nearest known pixel.
+@kernel_for_pixels
+def _mirror_into_hole(y: int, x: int, rgb: Any, hole: Any, depth: Any, nearest: Any) -> None:
+    """Fill a hole pixel, in place, with its mirror image about the nearest known pixel.
 
     A mirrored texture is a better start of the search than a smooth guess. A hole pixel keeps its
     colour if its mirror image is unknown or lies on another surface.
 
     Args:
+        y, x: the pixel.
         rgb: [h, w, 3] changed in the hole.
         hole: [h, w] bool.
         depth: [h, w] log inverse depth in units of its standard deviation.
         nearest: [2, h, w] row and column of the nearest known pixel.
     """
+    if not hole[y, x]:
+        return
     height, width = hole.shape
-    for y in range(height):
-        for x in range(width):
-            if not hole[y, x]:
-                continue
-            # (v, u) is the mirror image: the nearest known pixel lies halfway to it.
-            v = 2 * nearest[0, y, x] - y
-            u = 2 * nearest[1, y, x] - x
-            is_inside = 0 <= v < height and 0 <= u < width
-            if is_inside and not hole[v, u] and abs(depth[v, u] - depth[y, x]) < SAME_SURFACE_DEPTH:
-                rgb[y, x] = rgb[v, u]
+    # (v, u) is the mirror image: the nearest known pixel lies halfway to it.
+    v = 2 * nearest[0, y, x] - y
+    u = 2 * nearest[1, y, x] - x
+    is_inside = 0 <= v < height and 0 <= u < width
+    if is_inside and not hole[v, u] and abs(depth[v, u] - depth[y, x]) < SAME_SURFACE_DEPTH:
+        for channel in range(3):
+            rgb[y, x, channel] = rgb[v, u, channel]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Matches:
     """The best patches for the n pixels of a level's hole."""
 
-    numbers: Ints  # [h, w] the number of each hole pixel; −1 outside of the hole
-    positions: Ints  # [n, 3] source, row and column of the centre of each hole pixel's patch
-    costs: Floats  # [n]
+    numbers: Tensor  # [h, w] int32, the number of each hole pixel; −1 outside of the hole
+    positions: Tensor  # [n, 3] int32, source, row and column of the centre of each pixel's patch
+    costs: Tensor  # [n]
 
 
 def _match_level(level: _Level, coarse: _Matches | None, level_number: int) -> _Matches | None:
@@ -240,7 +231,7 @@ def _match_level(level: _Level, coarse: _Matches | None, level_number: int) -> _
         The matches; None if the level has no hole, or no patch that is known as a whole.
     """
     is_usable = _usable_patches(level.hole)
-    if not is_usable.any() or not level.hole.any():
+    if not bool(is_usable.any()) or not bool(level.hole.any()):
         return None
     search = _LevelSearch(level, is_usable)
     search.start_from(coarse)
@@ -258,10 +249,10 @@ def _match_level(level: _Level, coarse: _Matches | None, level_number: int) -> _
     return search.matches
 
 
-def _usable_patches(hole: Bools) -> Bools:
+def _usable_patches(hole: Tensor) -> Tensor:
     """Whether a patch around each pixel [h, w] lies inside the picture and has no hole pixel."""
     # A patch has a hole pixel if there is one within its radius around the centre.
-    is_usable: Bools = ~maximum_filter(torch.from_numpy(hole), PATCH_RADIUS).numpy()
+    is_usable = ~maximum_filter(hole, PATCH_RADIUS)
     # Nor may a patch reach beyond the picture's border.
     is_usable[:PATCH_RADIUS] = False
     is_usable[-PATCH_RADIUS:] = False
@@ -273,7 +264,7 @@ def _usable_patches(hole: Bools) -> Bools:
 class _LevelSearch:
     """The search for patches at one level of the pyramid."""
 
-    def __init__(self, level: _Level, is_usable: Bools) -> None:
+    def __init__(self, level: _Level, is_usable: Tensor) -> None:
         """Number the hole's pixels and build the images that the kernels read.
 
         Args:
@@ -282,13 +273,12 @@ class _LevelSearch:
         """
         height, width = level.hole.shape
         self._rgb = level.rgb
-        self._hole_pixels = np.argwhere(level.hole).astype(np.int32)  # [n, 2] rows, columns
-        self._usable_centers = np.argwhere(is_usable).astype(np.int32)  # [k, 2]
+        self._hole_pixels = level.hole.nonzero().int()  # [n, 2] rows, columns
+        self._usable_centers = is_usable.nonzero().int()  # [k, 2]
         self._is_usable = _with_mirror_image(is_usable)
-        # Zeros around the picture let a patch at its border reach beyond it.
-        padding = (PATCH_RADIUS, PATCH_RADIUS)
         self._inputs = CostInputs(
-            padded_rgb=np.pad(level.rgb, (padding, padding, (0, 0))),
+            # Zeros around the picture let a patch at its border reach beyond it.
+            padded_rgb=pad(level.rgb, (0, 0, *(PATCH_RADIUS,) * 4)),
             weights=level.weights,
             traits=level.traits,
             source_rgb=_with_mirror_image(level.rgb),
@@ -299,18 +289,17 @@ class _LevelSearch:
 
         # Matches and costs are kept for the hole's pixels only, in the order of these numbers.
         count = len(self._hole_pixels)
-        numbers = np.full((height, width), -1, np.int32)
-        numbers[level.hole] = np.arange(count)
-        self.matches = _Matches(
-            numbers, np.empty((count, 3), np.int32), np.zeros(count, np.float32)
-        )
+        numbers = self._hole_pixels.new_full((height, width), -1)
+        numbers[level.hole] = torch.arange(count, dtype=torch.int32, device=numbers.device)
+        self.matches = _Matches(numbers, numbers.new_empty(count, 3), level.rgb.new_zeros(count))
 
     def start_from(self, coarse: _Matches | None) -> None:
         """Take the first matches from the coarser level; at random if `coarse` is None."""
         # Without a coarser level, the kernel reads nothing of one, but its arguments must be
         # arrays; this level's own stand in.
         parents = self.matches if coarse is None else coarse
-        start_matches(
+        start_match(
+            len(self._hole_pixels),
             self._hole_pixels,
             coarse is not None,  # has_coarse
             parents.numbers,
@@ -322,16 +311,12 @@ class _LevelSearch:
 
     def score(self) -> None:
         """Compute the cost of each hole pixel's patch anew, because a vote changed the colours."""
-        parallel_for_chunks(
-            lambda start, stop: score_matches(
-                start,
-                stop,
-                self._hole_pixels,
-                self.matches.positions,
-                self._inputs,
-                self.matches.costs,
-            ),
+        score_match(
             len(self._hole_pixels),
+            self._hole_pixels,
+            self.matches.positions,
+            self._inputs,
+            self.matches.costs,
         )
 
     def improve(self, step: int, seed: np.uint32) -> None:
@@ -342,26 +327,22 @@ class _LevelSearch:
             seed: makes the random candidates of this search differ from those of other searches.
         """
         # All pixels read the old matches of their neighbours, in copies that nobody changes, so the
-        # result does not depend on the order of the threads.
-        old_positions = self.matches.positions.copy()
-        old_costs = self.matches.costs.copy()
-        parallel_for_chunks(
-            lambda start, stop: improve_matches(
-                start,
-                stop,
-                self._hole_pixels,
-                self.matches.numbers,
-                old_positions,
-                old_costs,
-                self._is_usable,
-                self._usable_centers,
-                step,
-                seed,
-                self._inputs,
-                self.matches.positions,
-                self.matches.costs,
-            ),
+        # result does not depend on the order in which pixels are done.
+        old_positions = self.matches.positions.clone()
+        old_costs = self.matches.costs.clone()
+        improve_match(
             len(self._hole_pixels),
+            self._hole_pixels,
+            self.matches.numbers,
+            old_positions,
+            old_costs,
+            self._is_usable,
+            self._usable_centers,
+            step,
+            seed,
+            self._inputs,
+            self.matches.positions,
+            self.matches.costs,
         )
 
     def vote(self, mean_cost: float) -> None:
@@ -370,25 +351,21 @@ class _LevelSearch:
         A patch weighs exp(−cost / mean_cost), so one that costs much more than the mean weighs
         little.
         """
-        parallel_for_chunks(
-            lambda start, stop: vote_colors(
-                start,
-                stop,
-                self._hole_pixels,
-                self.matches.numbers,
-                self.matches.positions,
-                self.matches.costs,
-                np.float32(max(mean_cost, MIN_MEAN_COST)),
-                self._inputs.source_rgb,
-                self._rgb,
-            ),
+        vote_color(
             len(self._hole_pixels),
+            self._hole_pixels,
+            self.matches.numbers,
+            self.matches.positions,
+            self.matches.costs,
+            np.float32(max(mean_cost, MIN_MEAN_COST)),
+            self._inputs.source_rgb,
+            self._rgb,
         )
         # The next search compares patches of the padded copy, which must have the new colours.
         inner = slice(PATCH_RADIUS, -PATCH_RADIUS)
         self._inputs.padded_rgb[inner, inner] = self._rgb
 
 
-def _with_mirror_image(image: NDArray[Any]) -> NDArray[Any]:
+def _with_mirror_image(image: Tensor) -> Tensor:
     """A copy [2, h, w, ...] of an image [h, w, ...] and of the image mirrored left to right."""
-    return np.ascontiguousarray(np.stack([image, image[:, ::-1]]))
+    return torch.stack([image, image.flip(1)])

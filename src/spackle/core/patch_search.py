@@ -7,12 +7,14 @@ column of the centre of a patch. A patch is *usable* if all its pixels are known
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 
 from spackle.runtime.kernels import kernel, reordering_kernel
+from spackle.runtime.parallel_kernels import kernel_for_items
 
 PATCH_RADIUS = 3
 PATCH_SIDE = 2 * PATCH_RADIUS + 1  # patches have 7×7 pixels
@@ -31,11 +33,11 @@ NEIGHBOR_DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 class CostInputs(NamedTuple):
     """The images on which the cost of a patch depends; [h, w] is the size of the picture."""
 
-    padded_rgb: NDArray[np.float32]  # [h + 6, w + 6, 3] the picture with three zeros at each side
-    weights: NDArray[np.float32]  # [h + 6, w + 6] of pixels in a patch; 0 beyond the picture
-    traits: NDArray[np.float32]  # [h, w, 4] tone and depth, scaled: squared differences are costs
-    source_rgb: NDArray[np.float32]  # [2, h, w, 3] the picture and its mirror image
-    source_traits: NDArray[np.float32]  # [2, h, w, 4] the traits and their mirror image
+    padded_rgb: Tensor  # [h + 6, w + 6, 3] the picture with three zeros at each side
+    weights: Tensor  # [h + 6, w + 6] of pixels in a patch; 0 beyond the picture
+    traits: Tensor  # [h, w, 4] tone and depth, scaled: squared differences are costs
+    source_rgb: Tensor  # [2, h, w, 3] the picture and its mirror image
+    source_traits: Tensor  # [2, h, w, 4] the traits and their mirror image
     distance_weight: np.float32  # cost of a squared pixel between a hole pixel and its patch
 
 
@@ -134,33 +136,29 @@ def patch_cost(inputs: Any, y: int, x: int, source: int, v: int, u: int, limit: 
     )
 
 
-@kernel
-def score_matches(
-    start: int, stop: int, hole_pixels: Any, matches: Any, inputs: Any, costs: Any
-) -> None:
-    """Compute the costs of the matches of the hole pixels start..stop.
+@kernel_for_items
+def score_match(n: int, hole_pixels: Any, matches: Any, inputs: Any, costs: Any) -> None:
+    """Compute the cost of the match of a hole pixel.
 
     Args:
-        start: number of the first pixel.
-        stop: number after the last pixel.
+        n: number of the hole pixel.
         hole_pixels: [n, 2] rows and columns.
         matches: [n, 3] source, row and column of each pixel's patch.
         inputs: the images, `CostInputs`.
         costs: [n] written.
     """
-    for n in range(start, stop):
-        y, x = hole_pixels[n]
-        source, v, u = matches[n]
-        # No patch costs as much as this limit, so every cost is computed to its end.
-        costs[n] = patch_cost(inputs, y, x, source, v, u, LARGE_COST)
+    y, x = hole_pixels[n]
+    source, v, u = matches[n]
+    # No patch costs as much as this limit, so every cost is computed to its end.
+    costs[n] = patch_cost(inputs, y, x, source, v, u, LARGE_COST)
 
 
-@kernel
-def start_matches(
-    hole_pixels: Any, has_coarse: bool, coarse_numbers: Any, coarse_matches: Any,
+@kernel_for_items
+def start_match(
+    n: int, hole_pixels: Any, has_coarse: bool, coarse_numbers: Any, coarse_matches: Any,
     is_usable: Any, usable_centers: Any, matches: Any,
 ) -> None:  # fmt: skip
-    """Take the first match of each hole pixel from the level of half the size, or at random.
+    """Take the first match of a hole pixel from the level of half the size, or at random.
 
     A match is the source of a patch (0 for the picture, 1 for its mirror image), and the row and
     column of the patch's centre in the source.
@@ -176,43 +174,41 @@ def start_matches(
     """
     coarse_height, coarse_width = coarse_numbers.shape
     height, width = is_usable.shape[1:]
-    for n in range(len(hole_pixels)):
-        y, x = hole_pixels[n]
-        # A random patch of the picture stays where the coarser level has no match that fits.
-        center = usable_centers[hash_uint32(np.uint32(n)) % np.uint32(len(usable_centers))]
-        matches[n, 0], matches[n, 1], matches[n, 2] = 0, center[0], center[1]
-        if not has_coarse:
-            continue
+    y, x = hole_pixels[n]
+    # A random patch of the picture stays where the coarser level has no match that fits.
+    center = usable_centers[hash_uint32(np.uint32(n)) % np.uint32(len(usable_centers))]
+    matches[n, 0], matches[n, 1], matches[n, 2] = 0, center[0], center[1]
+    if not has_coarse:
+        return
 
-        k = coarse_numbers[min(y // 2, coarse_height - 1), min(x // 2, coarse_width - 1)]
-        if k < 0:
-            continue
-        source = coarse_matches[k, 0]
-        # Halving an odd width rounds up, as if the picture had one more column at its right. In the
-        # mirror image, that column comes first, so that doubled columns are one too large there:
-        # `shift` is -1 for an odd width, and 0 for an even one.
-        shift = width - 2 * coarse_width if source else 0
-        row = 2 * coarse_matches[k, 1] + y % 2
-        column = 2 * coarse_matches[k, 2] + x % 2 + shift
-        is_inside = 0 <= row < height and 0 <= column < width
-        if is_inside and is_usable[source, row, column]:
-            matches[n, 0], matches[n, 1], matches[n, 2] = source, row, column
+    k = coarse_numbers[min(y // 2, coarse_height - 1), min(x // 2, coarse_width - 1)]
+    if k < 0:
+        return
+    source = coarse_matches[k, 0]
+    # Halving an odd width rounds up, as if the picture had one more column at its right. In the
+    # mirror image, that column comes first, so that doubled columns are one too large there:
+    # `shift` is -1 for an odd width, and 0 for an even one.
+    shift = width - 2 * coarse_width if source else 0
+    row = 2 * coarse_matches[k, 1] + y % 2
+    column = 2 * coarse_matches[k, 2] + x % 2 + shift
+    is_inside = 0 <= row < height and 0 <= column < width
+    if is_inside and is_usable[source, row, column]:
+        matches[n, 0], matches[n, 1], matches[n, 2] = source, row, column
 
 
-@kernel
-def improve_matches(
-    start: int, stop: int, hole_pixels: Any, numbers: Any, old_matches: Any, old_costs: Any,
+@kernel_for_items
+def improve_match(
+    n: int, hole_pixels: Any, numbers: Any, old_matches: Any, old_costs: Any,
     is_usable: Any, usable_centers: Any, step: int, seed: Any, inputs: Any,
     matches: Any, costs: Any,
 ) -> None:  # fmt: skip
-    """Try other patches for the hole pixels start..stop, and keep the best one of each.
+    """Try other patches for a hole pixel, and keep the best one.
 
     The candidates are the patches beside those of the neighbours' matches, a random patch, and
     random patches closer and closer to the best one.
 
     Args:
-        start: number of the first pixel.
-        stop: number after the last pixel.
+        n: number of the hole pixel.
         hole_pixels: [n, 2] rows and columns.
         numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
         old_matches: [n, 3] source, row and column of each pixel's patch.
@@ -226,68 +222,66 @@ def improve_matches(
         costs: [n] written.
     """
     source_count, height, width = is_usable.shape
-    for n in range(start, stop):
-        y, x = hole_pixels[n]
-        cost = old_costs[n]
-        source = np.int64(old_matches[n, 0])
-        row, column = np.int64(old_matches[n, 1]), np.int64(old_matches[n, 2])
+    y, x = hole_pixels[n]
+    cost = old_costs[n]
+    source = np.int64(old_matches[n, 0])
+    row, column = np.int64(old_matches[n, 1]), np.int64(old_matches[n, 2])
 
-        # If a neighbour's patch fits, the patch beside it probably fits here.
-        for direction in NEIGHBOR_DIRECTIONS:
-            dy, dx = direction[0] * step, direction[1] * step
-            if not (0 <= y + dy < height and 0 <= x + dx < width):
-                continue
-            k = numbers[y + dy, x + dx]
-            if k < 0:
-                continue
-            new_source = np.int64(old_matches[k, 0])
-            v, u = np.int64(old_matches[k, 1]) - dy, np.int64(old_matches[k, 2]) - dx
-            if 0 <= v < height and 0 <= u < width and is_usable[new_source, v, u]:
-                new_cost = patch_cost(inputs, y, x, new_source, v, u, cost)
-                if new_cost < cost:
-                    cost, source, row, column = new_cost, new_source, v, u
+    # If a neighbour's patch fits, the patch beside it probably fits here.
+    for direction in NEIGHBOR_DIRECTIONS:
+        dy, dx = direction[0] * step, direction[1] * step
+        if not (0 <= y + dy < height and 0 <= x + dx < width):
+            continue
+        k = numbers[y + dy, x + dx]
+        if k < 0:
+            continue
+        new_source = np.int64(old_matches[k, 0])
+        v, u = np.int64(old_matches[k, 1]) - dy, np.int64(old_matches[k, 2]) - dx
+        if 0 <= v < height and 0 <= u < width and is_usable[new_source, v, u]:
+            new_cost = patch_cost(inputs, y, x, new_source, v, u, cost)
+            if new_cost < cost:
+                cost, source, row, column = new_cost, new_source, v, u
 
-        # A random patch of either source, because the good ones may lie far from all matches.
-        random = hash_uint32(np.uint32(n) * PIXEL_SEED_STEP + seed)
-        center = usable_centers[random % np.uint32(len(usable_centers))]
+    # A random patch of either source, because the good ones may lie far from all matches.
+    random = hash_uint32(np.uint32(n) * PIXEL_SEED_STEP + seed)
+    center = usable_centers[random % np.uint32(len(usable_centers))]
+    random = hash_uint32(random)
+    new_source = np.int64(random % np.uint32(source_count))
+    v, u = np.int64(center[0]), np.int64(width - 1 - center[1] if new_source else center[1])
+    new_cost = patch_cost(inputs, y, x, new_source, v, u, cost)
+    if new_cost < cost:
+        cost, source, row, column = new_cost, new_source, v, u
+
+    # Random patches around the best one, in squares that shrink from half the picture's side.
+    radius = max(height, width) // 4
+    while radius >= 1:
         random = hash_uint32(random)
-        new_source = np.int64(random % np.uint32(source_count))
-        v, u = np.int64(center[0]), np.int64(width - 1 - center[1] if new_source else center[1])
-        new_cost = patch_cost(inputs, y, x, new_source, v, u, cost)
-        if new_cost < cost:
-            cost, source, row, column = new_cost, new_source, v, u
+        side = np.uint32(2 * radius + 1)
+        v = row + np.int64(random % side) - radius
+        u = column + np.int64((random >> np.uint32(12)) % side) - radius  # other random bits
+        if 0 <= v < height and 0 <= u < width and is_usable[source, v, u]:
+            new_cost = patch_cost(inputs, y, x, source, v, u, cost)
+            if new_cost < cost:
+                cost, row, column = new_cost, v, u
+        radius //= 4
 
-        # Random patches around the best one, in squares that shrink from half the picture's side.
-        radius = max(height, width) // 4
-        while radius >= 1:
-            random = hash_uint32(random)
-            side = np.uint32(2 * radius + 1)
-            v = row + np.int64(random % side) - radius
-            u = column + np.int64((random >> np.uint32(12)) % side) - radius  # other random bits
-            if 0 <= v < height and 0 <= u < width and is_usable[source, v, u]:
-                new_cost = patch_cost(inputs, y, x, source, v, u, cost)
-                if new_cost < cost:
-                    cost, row, column = new_cost, v, u
-            radius //= 4
-
-        costs[n] = cost
-        matches[n, 0], matches[n, 1], matches[n, 2] = source, row, column
+    costs[n] = cost
+    matches[n, 0], matches[n, 1], matches[n, 2] = source, row, column
 
 
-@kernel
-def vote_colors(
-    start: int, stop: int, hole_pixels: Any, numbers: Any, matches: Any, costs: Any,
+@kernel_for_items
+def vote_color(
+    n: int, hole_pixels: Any, numbers: Any, matches: Any, costs: Any,
     mean_cost: Any, source_rgb: Any, rgb: Any,
 ) -> None:  # fmt: skip
-    """Set the colours of the hole pixels start..stop to means over all patches that cover them.
+    """Set the colour of a hole pixel to the mean over all patches that cover it.
 
     Each hole pixel has a match: a patch of 7×7 pixels that is to be copied around it, so the
     patches of all hole pixels nearby cover a pixel. A patch has the weight exp(−cost / mean_cost),
     plus a millionth that keeps the weights from adding up to 0.
 
     Args:
-        start: number of the first pixel.
-        stop: number after the last pixel.
+        n: number of the hole pixel.
         hole_pixels: [n, 2] rows and columns.
         numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
         matches: [n, 3] source, row and column of the centre of each pixel's patch.
@@ -297,25 +291,24 @@ def vote_colors(
         rgb: [h, w, 3] written at the hole pixels.
     """
     height, width = numbers.shape
-    for n in range(start, stop):
-        y, x = hole_pixels[n]
-        red, green, blue = np.float32(0), np.float32(0), np.float32(0)
-        weight_sum = np.float32(0)
-        for dy in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
-            for dx in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
-                if not (0 <= y + dy < height and 0 <= x + dx < width):
-                    continue
-                k = numbers[y + dy, x + dx]
-                if k < 0:
-                    continue
-                # This pixel lies at (−dy, −dx) from the neighbour, so its colour comes from the
-                # pixel at (−dy, −dx) from the centre of the neighbour's patch.
-                source, v, u = matches[k, 0], matches[k, 1] - dy, matches[k, 2] - dx
-                weight = np.float32(np.exp(-costs[k] / mean_cost)) + np.float32(MIN_VOTE_WEIGHT)
-                red += weight * source_rgb[source, v, u, 0]
-                green += weight * source_rgb[source, v, u, 1]
-                blue += weight * source_rgb[source, v, u, 2]
-                weight_sum += weight
-        rgb[y, x, 0] = red / weight_sum
-        rgb[y, x, 1] = green / weight_sum
-        rgb[y, x, 2] = blue / weight_sum
+    y, x = hole_pixels[n]
+    red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+    weight_sum = np.float32(0)
+    for dy in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+        for dx in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+            if not (0 <= y + dy < height and 0 <= x + dx < width):
+                continue
+            k = numbers[y + dy, x + dx]
+            if k < 0:
+                continue
+            # This pixel lies at (−dy, −dx) from the neighbour, so its colour comes from the
+            # pixel at (−dy, −dx) from the centre of the neighbour's patch.
+            source, v, u = matches[k, 0], matches[k, 1] - dy, matches[k, 2] - dx
+            weight = np.float32(math.exp(-costs[k] / mean_cost)) + np.float32(MIN_VOTE_WEIGHT)
+            red += weight * source_rgb[source, v, u, 0]
+            green += weight * source_rgb[source, v, u, 1]
+            blue += weight * source_rgb[source, v, u, 2]
+            weight_sum += weight
+    rgb[y, x, 0] = red / weight_sum
+    rgb[y, x, 1] = green / weight_sum
+    rgb[y, x, 2] = blue / weight_sum

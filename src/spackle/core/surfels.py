@@ -11,8 +11,8 @@ from torch.nn.functional import pad
 
 from spackle.core.camera import Camera, to_like
 from spackle.core.gaussians import Gaussians, quat_from_matrix
-from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
+from spackle.runtime.parallel_kernels import kernel_for_pixels
 
 # Relative difference of inverse depth between neighbouring pixels above which there is an edge
 # between two surfaces.
@@ -125,52 +125,45 @@ def inverse_depth_slope(inverse_depth: Tensor) -> Tensor:
         inverse_depth: [H, W] float32 or float64, positive everywhere. The result is detached from
             autograd.
     """
-    image = inverse_depth.detach().cpu().contiguous().numpy()
-    slopes = np.empty((*image.shape, 2), image.dtype)
+    image = inverse_depth.detach().contiguous()
+    slopes = image.new_empty(*image.shape, 2)
     # Limits of the image's dtype, because others would make the kernel compute in float64.
-    crease_ratio = image.dtype.type(CREASE_RATIO)
-    edge_ratio = image.dtype.type(DEPTH_EDGE_RATIO)
-    parallel_for_chunks(
-        lambda start, stop: _slopes_of_rows(start, stop, image, crease_ratio, edge_ratio, slopes),
-        len(image),
-    )
-    return torch.from_numpy(slopes).to(inverse_depth.device)
+    number = np.float32 if image.dtype == torch.float32 else np.float64
+    _write_slopes(image.shape, image, number(CREASE_RATIO), number(DEPTH_EDGE_RATIO), slopes)
+    return slopes
 
 
-@kernel
-def _slopes_of_rows(
-    start: int, stop: int, image: Any, crease_ratio: Any, edge_ratio: Any, slopes: Any
+@kernel_for_pixels
+def _write_slopes(
+    y: int, x: int, image: Any, crease_ratio: Any, edge_ratio: Any, slopes: Any
 ) -> None:
-    """Write the slopes along x and y for the rows start..stop of an image.
+    """Write the slopes along x and y of one pixel of an image.
 
     Args:
-        start: the first row.
-        stop: the row after the last one.
+        y, x: the pixel.
         image: [H, W] inverse depth.
         crease_ratio: if the differences to the previous and to the next pixel differ by more than
             this multiple of the inverse depth, the surface has a crease there.
         edge_ratio: if neighbouring pixels differ by more than this multiple of the inverse depth,
             there is an edge between two surfaces.
-        slopes: [H, W, 2] written.
+        slopes: output [H, W, 2].
     """
     height, width = image.shape
-    for y in range(start, stop):
-        above, below = max(y - 1, 0), min(y + 1, height - 1)
-        for x in range(width):
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            here = image[y, x]
+    above, below = max(y - 1, 0), min(y + 1, height - 1)
+    left, right = max(x - 1, 0), min(x + 1, width - 1)
+    here = image[y, x]
 
-            # At the image's border, a pixel has one neighbour along an axis, and the difference to
-            # it serves for both sides.
-            to_right, to_left = image[y, right] - here, here - image[y, left]
-            forward = to_right if right > x else to_left
-            backward = to_left if left < x else to_right
-            slopes[y, x, 0] = _slope(here, backward, forward, crease_ratio, edge_ratio)
+    # At the image's border, a pixel has one neighbour along an axis, and the difference to it
+    # serves for both sides.
+    to_right, to_left = image[y, right] - here, here - image[y, left]
+    forward = to_right if right > x else to_left
+    backward = to_left if left < x else to_right
+    slopes[y, x, 0] = _slope(here, backward, forward, crease_ratio, edge_ratio)
 
-            to_below, to_above = image[below, x] - here, here - image[above, x]
-            forward = to_below if below > y else to_above
-            backward = to_above if above < y else to_below
-            slopes[y, x, 1] = _slope(here, backward, forward, crease_ratio, edge_ratio)
+    to_below, to_above = image[below, x] - here, here - image[above, x]
+    forward = to_below if below > y else to_above
+    backward = to_above if above < y else to_below
+    slopes[y, x, 1] = _slope(here, backward, forward, crease_ratio, edge_ratio)
 
 
 @kernel

@@ -96,7 +96,7 @@ def encode_srgb(linear: np.float32) -> np.float32:
 
     # As a function of the fourth root of the linear value, sRGB's power curve is nearly straight.
     # So t is this root, moved to -1..1, and the curve is S0 + S1·t + … + S8·t⁸.
-    t = (np.sqrt(np.sqrt(value)) - ROOT_MIDDLE) / ROOT_SPREAD
+    t = (math.sqrt(math.sqrt(value)) - ROOT_MIDDLE) / ROOT_SPREAD
     curve = S0 + t * (S1 + t * (S2 + t * (S3 + t * (S4 + t * (S5 + t * (S6 + t * (S7 + t * S8)))))))
     return SRGB_LINE * value if value <= SRGB_KNEE else min(curve, ONE)
 
@@ -109,7 +109,7 @@ def decode_srgb(encoded: np.float32) -> np.float32:
     # sRGB's formula is y^2.4. With q = y^¼ this is y²·q^1.6, and q^1.6 is so nearly straight that a
     # polynomial with the coefficients D0 to D5 approximates it well.
     y = (value + np.float32(0.055)) / np.float32(1.055)
-    q = np.sqrt(np.sqrt(y))
+    q = math.sqrt(math.sqrt(y))
     curve = y * y * (D0 + q * (D1 + q * (D2 + q * (D3 + q * (D4 + q * D5)))))
     return value / SRGB_LINE if value <= ENCODED_KNEE else min(curve, ONE)
 

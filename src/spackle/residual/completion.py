@@ -22,6 +22,7 @@ from spackle.residual.features import CELL, MASK_THRESHOLD, ViewFeatures, hole_m
 from spackle.residual.initializer import InitialGaussians, initialize, sample_photo
 from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.runtime.device import Precision
+from spackle.runtime.parallel_kernels import device_for_kernels
 
 MIN_AUX_GAUSSIANS = 64  # least number of aux Gaussians in a view (paper, "Training Details")
 # Which cells of a view (2×2 pixels) get an aux Gaussian: "masked" are those in holes, the paper's
@@ -67,14 +68,15 @@ class ViewCompletion:
         """Keep the view; nothing is computed yet.
 
         Args:
-            rendering: the base's Gaussians rendered from the view, on any device (eqs. 2 and 3).
+            rendering: the base's Gaussians rendered from the view (eqs. 2 and 3). All is computed
+                on its device; if this is a GPU on which kernels do not run, on the processor.
             camera: of the view.
             photo_camera: of the photo from which the base was predicted.
             get_photo: returns the photo I of eq. 5, [H', W', 3] sRGB, of the size of its camera;
                 called only for a network that names "photo".
             threshold: τ_α of eq. 4: a pixel with a lower opacity is a hole.
         """
-        self.rendering = rendering
+        self.rendering = rendering.to(device_for_kernels(rendering.alpha.device))
         self.camera = camera
         self.photo_camera = photo_camera
         self.threshold = threshold
@@ -99,7 +101,7 @@ class ViewCompletion:
         chosen instead.
         """
         hole = hole_mask(self.rendering.alpha, self.threshold)
-        cells = hole[::CELL, ::CELL].cpu()
+        cells = hole[::CELL, ::CELL]
         if int(cells.count_nonzero()) >= at_least:
             return cells
 
@@ -186,7 +188,7 @@ class ViewCompletion:
         *,
         cells: Tensor | None = None,
     ) -> Tensor | None:
-        """The network's changes [h, w, 14] of the initial Gaussians (eq. 5), float32 on the CPU.
+        """The network's changes [h, w, 14] of the initial Gaussians (eq. 5), float32.
 
         The initial Gaussians are the first guess of what fills each cell of 2×2 pixels. Without a
         network the result is None.

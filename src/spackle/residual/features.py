@@ -17,8 +17,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.render.fast_math import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
-from spackle.runtime.device import parallel_for_chunks
-from spackle.runtime.kernels import kernel
+from spackle.runtime.parallel_kernels import kernel_for_pixels
 
 MASK_THRESHOLD = 0.95  # τ_α of eq. 4: a pixel with a lower opacity is a hole
 CELL = 2  # pixels along a cell's side
@@ -43,14 +42,15 @@ def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
     """
     hole = hole_mask(alpha, threshold)
 
-    # NumPy counts bools several times faster than torch does.
-    hole_pixels = int(np.count_nonzero(hole.cpu().numpy()))
-    return hole_pixels / hole.numel()
+    # NumPy counts bools on the processor several times faster than torch does.
+    if hole.device.type == "cpu":
+        return int(np.count_nonzero(hole.numpy())) / hole.numel()
+    return int(hole.count_nonzero()) / hole.numel()
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewFeatures:
-    """A rendered view reduced to cells of 2×2 pixels, on the CPU and without gradients.
+    """A rendered view reduced to cells of 2×2 pixels, without gradients.
 
     h = ceil(H/2) and w = ceil(W/2): an odd last row or column of pixels counts twice.
     """
@@ -66,36 +66,39 @@ class ViewFeatures:
     def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> ViewFeatures:
         """Average the pixels [H, W] of a rendering in cells [h, w] of 2×2 pixels.
 
-        A pixel with an opacity below `threshold` is a hole.
+        A pixel with an opacity below `threshold` is a hole. The result is on the rendering's
+        device.
         """
-        rendering = rendering.to(torch.device("cpu")).detach()
-        # The kernel runs along whole rows, so colours become [H, 3W].
-        rgb = rendering.rgb.flatten(1).float().contiguous().numpy()
-        depth = rendering.depth.float().contiguous().numpy()
-        alpha = rendering.alpha.float().contiguous().numpy()
+        rendering = rendering.detach()
+        rgb = rendering.rgb.float().contiguous()
+        depth = rendering.depth.float().contiguous()
+        alpha = rendering.alpha.float().contiguous()
+        # Light is what is averaged, so each colour is decoded once before, and encoded after. Along
+        # whole rows [H, 3W] these conversions run in vector registers.
+        light = torch.empty_like(rgb)
+        _decode(_rows_and_numbers(rgb), rgb.flatten(1), light.flatten(1))
 
-        height, width = rendering.alpha.shape
+        height, width = alpha.shape
         rows = math.ceil(height / CELL)
         columns = math.ceil(width / CELL)
-        cell_rgb = np.empty((rows, RGB_CHANNELS * columns), np.float32)
-        cell_inverse_depth = np.empty((rows, columns), np.float32)
-        cell_alpha = np.empty((rows, columns), np.float32)
-        cell_mask = np.empty((rows, columns), np.bool_)
-
-        def average_rows(start: int, stop: int) -> None:
-            """Write the rows start..stop of all four grids of cells."""
-            _average_cells(
-                start, stop, rgb, depth, alpha, np.float32(threshold),
-                cell_rgb, cell_inverse_depth, cell_alpha, cell_mask,
-            )  # fmt: skip
-
-        parallel_for_chunks(average_rows, rows)
-        return ViewFeatures(
-            rgb=torch.from_numpy(cell_rgb.reshape(rows, columns, RGB_CHANNELS)),
-            inverse_depth=torch.from_numpy(cell_inverse_depth),
-            alpha=torch.from_numpy(cell_alpha),
-            mask=torch.from_numpy(cell_mask),
+        features = ViewFeatures(
+            rgb=rgb.new_empty(rows, columns, RGB_CHANNELS),
+            inverse_depth=depth.new_empty(rows, columns),
+            alpha=alpha.new_empty(rows, columns),
+            mask=torch.empty(rows, columns, dtype=torch.bool, device=alpha.device),
         )
+        _average_cell(
+            (rows, columns), light, depth, alpha, np.float32(threshold),
+            features.rgb, features.inverse_depth, features.alpha, features.mask,
+        )  # fmt: skip
+        cell_colors = features.rgb.flatten(1)
+        _encode(_rows_and_numbers(features.rgb), cell_colors, cell_colors)
+        return features
+
+
+def _rows_and_numbers(image: Tensor) -> tuple[int, int]:
+    """The number of rows of an image [H, W, C], and the number W·C of values in a row."""
+    return image.shape[0], image[0].numel()
 
 
 def cell_centers(camera: Camera) -> Tensor:
@@ -103,65 +106,61 @@ def cell_centers(camera: Camera) -> Tensor:
     return camera.even().pixel_centers(stride=CELL)
 
 
-@kernel
-def _average_cells(
-    start: int, stop: int, rgb: Any, depth: Any, alpha: Any, threshold: Any,
-    cell_rgb: Any, cell_inverse_depth: Any, cell_alpha: Any, cell_mask: Any,
+@kernel_for_pixels
+def _decode(row: int, k: int, encoded: Any, linear: Any) -> None:
+    """Convert the k-th number of a row from sRGB to linear light; arrays [H, 3W]."""
+    linear[row, k] = decode_srgb(encoded[row, k])
+
+
+@kernel_for_pixels
+def _encode(row: int, k: int, linear: Any, encoded: Any) -> None:
+    """Convert the k-th number of a row from linear light to sRGB; arrays [h, 3w]."""
+    encoded[row, k] = encode_srgb(linear[row, k])
+
+
+@kernel_for_pixels
+def _average_cell(
+    row: int, column: int, light: Any, depth: Any, alpha: Any, threshold: Any,
+    cell_light: Any, cell_inverse_depth: Any, cell_alpha: Any, cell_mask: Any,
 ) -> None:  # fmt: skip
-    """Average the pixels of each cell of 2×2 pixels, for the rows start..stop of cells.
+    """Average the pixels of a cell of 2×2 pixels.
 
     Args:
-        start, stop: first row of cells, and the row after the last.
-        rgb: [H, 3W] sRGB, already multiplied by the opacity (rendered over black).
+        row, column: of the cell.
+        light: [H, W, 3] linear, already multiplied by the opacity (rendered over black).
         depth: [H, W] z.
         alpha: [H, W] opacity; below `threshold`, the pixel is a hole.
         threshold: τ_α, float32.
-        cell_rgb: output [h, 3w] sRGB without the black background.
+        cell_light: output [h, w, 3] linear, without the black background.
         cell_inverse_depth: output [h, w], 1/z of the farthest pixel that is no hole; 0 if there is
             none.
         cell_alpha: output [h, w] mean opacity.
         cell_mask: output [h, w] bool: whether any pixel is a hole.
     """
     height, width = alpha.shape
-    columns = cell_inverse_depth.shape[1]
-    two_rows_light = np.empty(RGB_CHANNELS * width, np.float32)
-    mean_light = np.empty(RGB_CHANNELS * columns, np.float32)
-    for row in range(start, stop):
-        top = CELL * row
-        bottom = min(CELL * row + 1, height - 1)
+    top, left = CELL * row, CELL * column
+    # An odd last row or column of pixels counts twice.
+    bottom, right = min(top + 1, height - 1), min(left + 1, width - 1)
 
-        # The conversions from and to sRGB are loops over whole rows, which run in vector registers.
-        for k in range(RGB_CHANNELS * width):
-            two_rows_light[k] = decode_srgb(rgb[top, k]) + decode_srgb(rgb[bottom, k])
+    total_alpha = np.float32(0)
+    farthest = np.float32(0)
+    holes = 0
+    for y, x in ((top, left), (top, right), (bottom, left), (bottom, right)):
+        total_alpha += alpha[y, x]
+        if alpha[y, x] < threshold:
+            holes += 1
+        else:
+            farthest = max(farthest, depth[y, x], np.float32(TINY))
+    cell_mask[row, column] = holes > 0
+    cell_alpha[row, column] = total_alpha / np.float32(CELL_PIXELS)
+    cell_inverse_depth[row, column] = (
+        np.float32(1) / farthest if holes < CELL_PIXELS else np.float32(0)
+    )
 
-        for column in range(columns):
-            left = CELL * column
-            right = min(CELL * column + 1, width - 1)
-            total_alpha = np.float32(0)
-            farthest = np.float32(0)
-            holes = 0
-            for y, x in ((top, left), (top, right), (bottom, left), (bottom, right)):
-                total_alpha += alpha[y, x]
-                if alpha[y, x] < threshold:
-                    holes += 1
-                else:
-                    farthest = max(farthest, depth[y, x], np.float32(TINY))
-
-            cell_mask[row, column] = holes > 0
-            cell_alpha[row, column] = total_alpha / np.float32(CELL_PIXELS)
-            cell_inverse_depth[row, column] = (
-                np.float32(1) / farthest if holes < CELL_PIXELS else np.float32(0)
-            )
-
-            # Rendered light is already multiplied by alpha: divide by the sum of alpha, not by 4.
-            for c in range(RGB_CHANNELS):
-                light = (
-                    two_rows_light[RGB_CHANNELS * left + c]
-                    + two_rows_light[RGB_CHANNELS * right + c]
-                )
-                mean_light[RGB_CHANNELS * column + c] = light / max(
-                    total_alpha, np.float32(MIN_DIVISOR)
-                )
-
-        for k in range(RGB_CHANNELS * columns):
-            cell_rgb[row, k] = encode_srgb(mean_light[k])
+    # Rendered light is already multiplied by alpha: divide by the sum of alpha, not by 4.
+    for c in range(RGB_CHANNELS):
+        left_light = light[top, left, c] + light[bottom, left, c]
+        right_light = light[top, right, c] + light[bottom, right, c]
+        cell_light[row, column, c] = (left_light + right_light) / max(
+            total_alpha, np.float32(MIN_DIVISOR)
+        )

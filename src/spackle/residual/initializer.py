@@ -159,7 +159,7 @@ def sample_photo(
     place, z = _project_into_photo(inverse_depth, camera, photo_camera)
 
     # A cell has one colour, so the photo's pixels are averaged over 2×2 pixels as well.
-    photo_channels_first = photo.cpu().movedim(-1, 0)[None]  # [1, 3, H', W']
+    photo_channels_first = photo.to(inverse_depth.device).movedim(-1, 0)[None]  # [1, 3, H', W']
     photo_cells = avg_pool2d(photo_channels_first, CELL, ceil_mode=True, count_include_pad=False)
 
     # grid_sample counts from -1 to 1 across the photo. The clamp to -2..2 keeps the places of
@@ -196,15 +196,17 @@ def _project_into_photo(
     Returns:
         (x·z, y·z) as [h, w, 2], and z as [h, w, 1], float64.
     """
-    rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
+    uv = to_like(cell_centers(camera), inverse_depth).double()
+    rays, motion = _rays_in_photo(uv, camera, photo_camera)
 
     # A point is ray / inverse_depth + t in the photo's frame. Here it is multiplied by its inverse
     # depth, so that points at infinity stay finite; x, y and the sign of z do not change.
     points = rays + inverse_depth[..., None] * motion[:3, 3]  # [h, w, 3]
     z = points[..., 2:]
-    photo_K = photo_camera.K.cpu().double()
+    photo_K = to_like(photo_camera.K.double(), points)
     pixels = points[..., :2] * photo_K.diagonal()[:2] + z * photo_K[:2, 2]
-    return pixels / torch.tensor([photo_camera.width, photo_camera.height]), z
+    photo_size = to_like(torch.tensor([photo_camera.width, photo_camera.height]), points)
+    return pixels / photo_size, z
 
 
 def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:

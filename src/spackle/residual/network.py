@@ -81,10 +81,11 @@ def pad_to_stride(features: Tensor) -> Tensor:
 def predict_deltas(
     network: ResidualNet, features: Tensor, cells: Tensor, precision: Precision = "auto"
 ) -> Tensor:
-    """Deltas [h, w, 14] of a view, float32 on the CPU; 0 outside of `cells`.
+    """Deltas [h, w, 14] of a view, float32 on the features' device; 0 outside of `cells`.
 
-    A network whose deltas depend only on nearby cells (`network.local`) runs on a few rectangles
-    around `cells`; any other runs on the whole view.
+    On the processor, a network whose deltas depend only on nearby cells (`network.local`) runs on a
+    few rectangles around `cells`. Any other runs on the whole view; so does each on a GPU, which
+    takes less time for that than for the search of rectangles.
 
     Args:
         network: f_res, on any device.
@@ -94,8 +95,9 @@ def predict_deltas(
     """
     device = next(network.parameters()).device
     dtype = pick_dtype(precision, device)
-    deltas = torch.zeros(*cells.shape, DELTA_CHANNELS)
-    if network.local:
+    deltas = features.new_zeros(*cells.shape, DELTA_CHANNELS)
+    is_cropped = network.local and features.device.type == "cpu"
+    if is_cropped:
         # Outer rectangles begin at multiples of the stride, so that the network's coarsest grid is
         # the same in each of them.
         crops = crops_around_mask(cells, STRIDE)
@@ -113,12 +115,12 @@ def predict_deltas(
             # The outer rectangle gives context to the cells of the inner one.
             crop = features[(..., *outer.slices)]
             crop = crop.contiguous(memory_format=torch.channels_last).to(device)
-            if network.local:
+            if is_cropped:
                 inner_of_crop = inner.moved(-outer.top, -outer.left)
                 crop_deltas = network(crop, inner_of_crop)
             else:
                 crop_deltas = network(crop)
-            crop_deltas = crop_deltas[0].permute(1, 2, 0).float().cpu()  # [rows, columns, 14]
+            crop_deltas = crop_deltas[0].permute(1, 2, 0).to(deltas)  # [rows, columns, 14]
 
             # A rectangle also holds cells whose deltas nobody asked for; these stay 0.
             is_asked_for = cells[inner.slices][..., None]

@@ -1,7 +1,8 @@
 """Decorators that compile numeric functions by numba.
 
-`kernel` is the usual one. The decorators have types, which numba lacks, and recompile a kernel when
-a constant or another kernel that it uses has changed, which numba does not notice.
+`kernel` is the usual one; parallel_kernels.py has others, for what is computed for each item of a
+list or each pixel. The decorators have types, which numba lacks, and recompile a kernel when a
+constant or another kernel that it uses has changed, which numba does not notice.
 """
 
 from __future__ import annotations
@@ -28,22 +29,29 @@ MANTISSA_BITS = np.int32(23)  # of a float32
 # addition, ignore the sign of zero, approximate functions. It may not reorder sums ("reassoc"),
 # because results must be the same bit for bit, and may not assume finite numbers ("nnan", "ninf"),
 # because kernels test for NaN and infinity.
-_FASTMATH = {"contract", "nsz", "afn"}
+FASTMATH = {"contract", "nsz", "afn"}
 
 
 def kernel(function: Callable[..., R]) -> Callable[..., R]:
     """Compile a function at its first call, cache the machine code on disk, and free the GIL."""
-    return _compile(function, _FASTMATH)
+    return compile_kernel(function, FASTMATH)
 
 
 def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` whose sums may be reordered, which allows vector instructions."""
-    return _compile(function, {"reassoc", *_FASTMATH})
+    return compile_kernel(function, {"reassoc", *FASTMATH})
 
 
 def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` that is inlined into the calling loops, which allows vector instructions."""
-    return _compile(function, _FASTMATH, forceinline=True)
+    return compile_kernel(function, FASTMATH, forceinline=True)
+
+
+def compiled_function(value: Any) -> Callable[..., Any] | None:
+    """The Python function that was compiled as a kernel; None for anything else."""
+    if isinstance(value, Dispatcher):
+        return cast("Callable[..., Any]", value.py_func)
+    return None
 
 
 def is_compiled(function: Callable[..., Any]) -> bool:
@@ -54,13 +62,15 @@ def is_compiled(function: Callable[..., Any]) -> bool:
     return bool(disk_cache._load_index())  # numba's table of the versions on disk
 
 
-def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> Callable[..., R]:
+def compile_kernel(
+    function: Callable[..., R], fastmath: set[str], **options: Any
+) -> Callable[..., R]:
     """Compile a function by numba, with a disk cache that notices changes of what it uses.
 
     Numba keeps compiled functions on disk, and compiles again only if the function's own source
     file has changed. If a kernel or constant of another file, or an option, has changed, it would
     run the old machine code. So the stamp, by which numba knows the state of the source file, is
-    extended by all that the function may use.
+    extended by all that the function may use (`watch_globals`).
 
     Args:
         function: the function in Python.
@@ -70,6 +80,18 @@ def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> 
     compiled = numba.njit(
         cache=True, nogil=True, fastmath=fastmath, error_model="numpy", **options
     )(function)
+    watch_globals(compiled, function, (sorted(fastmath), sorted(options.items())))
+    return cast("Callable[..., R]", compiled)
+
+
+def watch_globals(compiled: Any, function: Callable[..., Any], options: object = None) -> None:
+    """Make numba compile again, in a new process, if what a function uses has changed.
+
+    Args:
+        compiled: what numba made of the function; it may lack a disk cache.
+        function: the function in Python.
+        options: a change of these compiles again, too.
+    """
     # The stamp is a private attribute. Numba's public way, a cache locator, would not do: an
     # environment variable sets it for all packages, and it knows neither function nor options.
     disk_cache = _disk_cache_of(compiled)
@@ -77,9 +99,8 @@ def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> 
         disk_cache._source_stamp = (
             disk_cache._source_stamp,
             _digest_of_globals(function),
-            repr((sorted(fastmath), sorted(options.items()))),
+            repr(options),
         )
-    return cast("Callable[..., R]", compiled)
 
 
 def _digest_of_globals(function: Callable[..., Any]) -> str:

@@ -116,7 +116,7 @@ class ViewEmptiness:
 
         # [2, H, W] row and column of the surface pixel that is nearest in the picture. Both are
         # negative if the view shows no surface; then the depth 0 of the first pixel is taken.
-        nearest = torch.from_numpy(nearest_known_pixels(is_empty.numpy())).long()
+        nearest = nearest_known_pixels(is_empty).long()
         row, column = nearest.clamp_min(0)
         nothing_known = torch.zeros_like(is_empty)
         return ViewEmptiness(

@@ -7,8 +7,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -123,7 +123,13 @@ class FillContext:
         visible_depth = rendering.depth[rendering.alpha >= self.threshold]
         if not len(visible_depth):
             return 1.0
-        return float(np.quantile(visible_depth.cpu().numpy(), NEAR_QUANTILE))
+
+        # Torch's `quantile` takes at most 2²⁴ numbers, and NumPy's would need them on the host. So
+        # the quantile is interpolated between the two depths around it, counted from 1.
+        position = 1 + NEAR_QUANTILE * (len(visible_depth) - 1)
+        below = float(visible_depth.kthvalue(math.floor(position)).values)
+        above = float(visible_depth.kthvalue(math.ceil(position)).values)
+        return below + (position - math.floor(position)) * (above - below)
 
     @property
     def without_network(self) -> FillContext:

@@ -1,6 +1,6 @@
 """Fill the holes of one view, or of all views of a path with one set of Gaussians.
 
-The renderer and the network run on the renderer's device; all other code runs on the CPU.
+All runs on the renderer's device, without copies to the host in between.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class FilledScene:
     """One set of added Gaussians for all views."""
 
     aux: Gaussians
-    # [H, W, 3] uint8 sRGB: final renderings of some views, by the view's index; nobody needs to
-    # render these views again
+    # [H, W, 3] uint8 sRGB, on the CPU: final renderings of some views, by the view's index; nobody
+    # needs to render these views again
     pictures: Mapping[int, Tensor]
 
 
@@ -86,8 +86,8 @@ def fill_view(
     filled = _fill_in_passes(
         context, renderer, view_rendering, camera, guards, max_hole_ratio=0, with_underlays=False
     )
-    aux = Gaussians.cat([Gaussians.empty(), *filled.aux])
-    return FilledView(aux.to(device), filled.rendering.to(device))
+    aux = Gaussians.cat([Gaussians.empty(device), *(part.to(device) for part in filled.aux)])
+    return FilledView(aux, filled.rendering.to(device))
 
 
 @torch.no_grad()
@@ -196,7 +196,7 @@ class _SceneFilling:
                 self.base_renderings[index] = rendering
 
         self.filled_views = 0
-        self.aux = [Gaussians.empty()]  # everything that was added
+        self.aux: list[Gaussians] = []  # everything that was added
 
         # Pairs (view's index, Gaussians that it needs beneath the rims of its holes). They wait
         # until the two widest views are filled, because one of these may show, and fill better,
@@ -254,7 +254,8 @@ class _SceneFilling:
         """All added Gaussians, and the pictures that show them."""
         if self.pending_underlays:
             self.pictures.clear()  # the underlays may appear in them
-        aux = Gaussians.cat([*self.aux, *self._place_underlays()])
+        added = [*self.aux, *self._place_underlays()]
+        aux = Gaussians.cat(added) if added else Gaussians.empty()
         return FilledScene(aux, self.pictures)
 
     def _view_context(self, hole_ratio: float) -> FillContext:
@@ -299,7 +300,7 @@ class _SceneFilling:
 
 @dataclasses.dataclass(frozen=True)
 class _FilledHoles:
-    """What the passes over one view have added, and the view rendered with it, on the CPU."""
+    """What the passes over one view have added, and the view rendered with it."""
 
     aux: list[Gaussians]
     # Beneath the rims of holes, not yet moved behind the surfaces of other views.

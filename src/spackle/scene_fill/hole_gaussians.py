@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from spackle.core.camera import Camera
+from spackle.core.camera import Camera, to_like
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import BEHIND_SURFACE_RATIO, PIXEL_SIGMA_PX
@@ -90,7 +90,7 @@ def fill_holes(
     smooth_scales = without_pits(moved_depths, mask) / depths
     scales = torch.where(scales > 0, smooth_scales, 0)
 
-    pixels = Gaussians.empty()
+    pixels = Gaussians.empty(cells.means.device)
     if context.texture is not None:
         # The texture adds detail to smooth colours of all cells: those of the new Gaussians in
         # holes, the rendered ones elsewhere. Other holes, which are not to be filled, were rendered
@@ -197,10 +197,11 @@ def pixel_gaussians(
     # The pixels lie on the cell's plane. Their inverse depth is at least half that of the cell's
     # centre, so that a steep plane does not carry them to infinity.
     cell_inverse_depth = repeat(initial.inverse_depth)
-    rise = (initial.slope[:, None] * PIXEL_OFFSETS).sum(-1).flatten()
+    offsets = to_like(PIXEL_OFFSETS, initial.uv)
+    rise = (initial.slope[:, None] * offsets).sum(-1).flatten()
     inverse_depth = (cell_inverse_depth + rise).clamp_min(0.5 * cell_inverse_depth)
     pixels = InitialGaussians(
-        uv=(initial.uv[:, None] + PIXEL_OFFSETS).flatten(0, 1),
+        uv=(initial.uv[:, None] + offsets).flatten(0, 1),
         inverse_depth=inverse_depth,
         slope=repeat(initial.slope),
         rgb=repeat(initial.rgb),

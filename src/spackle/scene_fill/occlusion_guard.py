@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,8 +22,8 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import BEHIND_SURFACE_RATIO
 from spackle.render.protocol import ALPHA_MIN, Rendering
 from spackle.residual.features import MASK_THRESHOLD
-from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
+from spackle.runtime.parallel_kernels import device_for_kernels, kernel_for_items
 
 WINDOW_RADIUS_PX = 4  # of the guard's windows: most new Gaussians reach no farther
 # A Gaussian is visible up to so many standard deviations from its centre: exp(-x² / 2) = ALPHA_MIN.
@@ -59,19 +59,20 @@ class OcclusionGuard:
         hide.
 
         Args:
-            rendering: the view [H, W], on any device.
+            rendering: the view [H, W]; the guard is on its device, if kernels run there.
             camera: of the view.
             threshold: pixels with a lower opacity are holes, and show no surface.
             keep_empty: [H, W] bool: pixels in which nothing may appear, such as sky; None: none.
         """
-        view = rendering.to(torch.device("cpu")).detach()
+        view = rendering.to(device_for_kernels(rendering.alpha.device)).detach()
         is_hole = view.alpha < threshold
         surface_depth = torch.where(is_hole, 0, view.depth).float()
         if keep_empty is not None:
             # Empty space is like a surface at infinity: everything would hide it. Not so at its
             # border: the filter below would carry this infinite depth onto the surfaces beside it,
             # so a strip of twice the filter's radius is left as it is.
-            is_beside_space = maximum_filter(~keep_empty.cpu(), 2 * WINDOW_RADIUS_PX)
+            is_shown = ~keep_empty.to(view.alpha.device)
+            is_beside_space = maximum_filter(is_shown, 2 * WINDOW_RADIUS_PX)
             surface_depth = torch.where(is_beside_space, surface_depth, torch.inf)
 
         # A Gaussian reaches some pixels around its centre, and may hide a surface at any of them.
@@ -124,38 +125,51 @@ def unoccluding_scales(
     """
     if not len(gaussians) or not guards:
         return torch.ones_like(gaussians.opacities)
-    eye = to_like(eye, gaussians.means)
-    eye_position = eye.cpu().double().numpy()
-    rays = (gaussians.means - eye).detach().cpu().double().numpy()  # [N, 3]
-    double_gaussians = gaussians.detach().to(dtype=torch.float64)
-    covariances = double_gaussians.covariances().cpu().flatten(1).numpy()  # [N, 9]
+    device = gaussians.means.device
+    rays = (gaussians.means - to_like(eye, gaussians.means)).detach().double()  # [N, 3]
+    covariances = gaussians.detach().to(dtype=torch.float64).covariances().flatten(1)  # [N, 9]
 
     # The guards' depth images differ in size, so their pixels are stored one image behind the
     # other.
-    cameras = np.stack([_camera_numbers(guard.camera) for guard in guards])
-    depths = np.concatenate([guard.depth.numpy().ravel() for guard in guards])
-    sizes = np.array([guard.depth.shape for guard in guards])  # [guards, 2]
-    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
+    sizes = torch.tensor([guard.depth.shape for guard in guards])  # [guards, 2]
+    ends = sizes.prod(dim=1).cumsum(0)
+    surfaces = GuardedSurfaces(
+        cameras=torch.stack([_camera_numbers(guard.camera) for guard in guards]).to(device),
+        depths=torch.cat([guard.depth.flatten() for guard in guards]).to(device),
+        sizes=sizes.to(device),
+        starts=(ends - sizes.prod(dim=1)).to(device),
+    )
+    scales = torch.empty(len(rays), dtype=torch.float64, device=device)
+    eye_position = Point(*eye.detach().double().tolist())
+    _find_scale(
+        len(rays), eye_position, rays.contiguous(), covariances.contiguous(), surfaces, scales
+    )
+    return scales.to(gaussians.means.dtype)
 
-    scales = np.empty(len(rays))
 
-    def search(first: int, stop: int) -> None:
-        """Write the factors of the Gaussians first..stop."""
-        _find_scales(
-            first, stop, eye_position, rays, covariances, cameras, depths, sizes, starts, scales
-        )
+class Point(NamedTuple):
+    """A point in the world."""
 
-    parallel_for_chunks(search, len(rays))
-    return torch.from_numpy(scales).to(gaussians.means)
+    x: float
+    y: float
+    z: float
 
 
-def _camera_numbers(camera: Camera) -> Any:
+class GuardedSurfaces(NamedTuple):
+    """The farthest surfaces near each pixel of several views, as a kernel reads them."""
+
+    # [guards, 16] float64: fx, fy, cx, cy, and the 3×4 extrinsics row by row
+    cameras: Tensor
+    depths: Tensor  # the pixels of all guards' depth images, one behind the other; 0 is no surface
+    sizes: Tensor  # [guards, 2] height and width of the images
+    starts: Tensor  # [guards] the place of each image's first pixel in `depths`
+
+
+def _camera_numbers(camera: Camera) -> Tensor:
     """A camera as 16 numbers, float64: fx, fy, cx, cy, and the 3×4 extrinsics row by row."""
-    numbers = np.empty(16)
-    K = camera.K.detach().cpu().numpy()
-    numbers[:4] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    numbers[4:] = camera.world_to_camera.detach().cpu().numpy()[:3].ravel()
-    return numbers
+    K = camera.K.detach().cpu().double()
+    extrinsics = camera.world_to_camera.detach().cpu().double()[:3]
+    return torch.cat([K[[0, 1, 0, 1], [0, 1, 2, 2]], extrinsics.flatten()])
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
@@ -178,64 +192,53 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
     return closed[cells]
 
 
-@kernel
-def _find_scales(
-    first: int, stop: int, eye: Any, rays: Any, covariances: Any,
-    cameras: Any, depths: Any, sizes: Any, starts: Any, scales: Any,
-) -> None:  # fmt: skip
-    """For each Gaussian, write the least of 48 factors by which it must move away from an eye to
-    hide no guarded surface; 0 if it hides one at all of them.
+@kernel_for_items
+def _find_scale(n: int, eye: Any, rays: Any, covariances: Any, surfaces: Any, scales: Any) -> None:
+    """For a Gaussian, write the least of 48 factors by which it must move away from an eye to hide
+    no guarded surface; 0 if it hides one at all of them.
 
     The factors are 1 / (1 − step / 48), for step = 0 … 47.
 
     Args:
-        first, stop: the Gaussians first..stop are done.
-        eye: [3] position from which the Gaussians move away.
+        n: number of the Gaussian.
+        eye: the point from which the Gaussians move away.
         rays: [N, 3] from the eye to the Gaussians' centres.
         covariances: [N, 9] in the world's frame.
-        cameras: [guards, 16]: fx, fy, cx, cy, and the 3×4 extrinsics row by row.
-        depths: the pixels of all guards' depth images, one behind the other; 0 is no surface.
-        sizes: [guards, 2] height and width of the images.
-        starts: [guards + 1] the place of each image's first pixel in `depths`.
+        surfaces: `GuardedSurfaces`.
         scales: output [N].
     """
-    for n in range(first, stop):
-        scales[n] = 0
-        for step in range(DEPTH_STEPS):
-            # The steps are even in inverse depth: 1 / scale = 1 - step / DEPTH_STEPS.
-            scale = 1.0 / (1.0 - step / DEPTH_STEPS)
-            x = eye[0] + scale * rays[n, 0]
-            y = eye[1] + scale * rays[n, 1]
-            z = eye[2] + scale * rays[n, 2]
-            hides_surface = False
-            for guard in range(len(cameras)):
-                if _hides_surface(
-                    cameras[guard], depths, starts[guard], sizes[guard, 0], sizes[guard, 1],
-                    x, y, z, covariances[n], scale,
-                ):  # fmt: skip
-                    hides_surface = True
-                    break
-            if not hides_surface:
-                scales[n] = scale
+    scales[n] = 0
+    for step in range(DEPTH_STEPS):
+        # The steps are even in inverse depth: 1 / scale = 1 - step / DEPTH_STEPS.
+        scale = 1.0 / (1.0 - step / DEPTH_STEPS)
+        x = eye.x + scale * rays[n, 0]
+        y = eye.y + scale * rays[n, 1]
+        z = eye.z + scale * rays[n, 2]
+        hides_surface = False
+        for guard in range(len(surfaces.starts)):
+            if _hides_surface(surfaces, guard, x, y, z, covariances[n], scale):
+                hides_surface = True
                 break
+        if not hides_surface:
+            scales[n] = scale
+            break
 
 
 @kernel
 def _hides_surface(
-    camera: Any, depths: Any, start: int, height: int, width: int,
-    x: float, y: float, z: float, covariance: Any, scale: float,
-) -> bool:  # fmt: skip
+    surfaces: Any, guard: int, x: float, y: float, z: float, covariance: Any, scale: float
+) -> bool:
     """Whether any part of a Gaussian lies in front of a surface of one guarded view.
 
     Args:
-        camera: [16] fx, fy, cx, cy, 3×4 extrinsics.
-        depths: depth images of all guards, in one row; 0 is no surface.
-        start: the place of this guard's first pixel in `depths`.
-        height, width: of this guard's image.
+        surfaces: `GuardedSurfaces` of all views.
+        guard: number of the view.
         x, y, z: the Gaussian's centre in the world.
         covariance: [9] of the Gaussian before it was scaled.
         scale: factor on the Gaussian's standard deviations.
     """
+    camera = surfaces.cameras[guard]
+    height, width = surfaces.sizes[guard, 0], surfaces.sizes[guard, 1]
     # Row by row of the extrinsics, (camera[4:8], camera[8:12], camera[12:16]) · (x, y, z, 1).
     depth = camera[12] * x + camera[13] * y + camera[14] * z + camera[15]
     if not depth > 0:
@@ -258,14 +261,16 @@ def _hides_surface(
 
     # Each depth of the guard is the greatest within a window around its pixel. So not every pixel
     # that the Gaussian covers has to be looked at: pixels one window apart see all of it.
+    # On a GPU, `ceil` and `floor` give floats.
     spacing_px = 2 * WINDOW_RADIUS_PX
-    steps_u = int(np.ceil(max(reach_u - WINDOW_RADIUS_PX, 0.0) / spacing_px))
-    steps_v = int(np.ceil(max(reach_v - WINDOW_RADIUS_PX, 0.0) / spacing_px))
+    steps_u = np.int64(math.ceil(max(reach_u - WINDOW_RADIUS_PX, 0.0) / spacing_px))
+    steps_v = np.int64(math.ceil(max(reach_v - WINDOW_RADIUS_PX, 0.0) / spacing_px))
+    start = surfaces.starts[guard]
     for j in range(-steps_v, steps_v + 1):
-        row = min(max(int(np.floor(v + spacing_px * j)), 0), height - 1)
+        row = min(max(np.int64(math.floor(v + spacing_px * j)), 0), height - 1)
         for i in range(-steps_u, steps_u + 1):
-            column = min(max(int(np.floor(u + spacing_px * i)), 0), width - 1)
-            surface_depth = depths[start + row * width + column]
+            column = min(max(np.int64(math.floor(u + spacing_px * i)), 0), width - 1)
+            surface_depth = surfaces.depths[start + row * width + column]
             # A Gaussian that lies just behind a surface would show through it.
             if depth < surface_depth * (1 + BEHIND_SURFACE_RATIO):
                 return True
@@ -294,5 +299,5 @@ def _reach_px(
     # The variance along the axis is (a, b, c) Σ (a, b, c)ᵀ; Σ is symmetric.
     variance = a * a * covariance[0] + b * b * covariance[4] + c * c * covariance[8]
     variance += 2 * (a * b * covariance[1] + a * c * covariance[2] + b * c * covariance[5])
-    reach = VISIBLE_SIGMAS * np.sqrt(max(variance, 0.0)) + 1.0  # one more, for a pixel's width
+    reach = VISIBLE_SIGMAS * math.sqrt(max(variance, 0.0)) + 1.0  # one more, for a pixel's width
     return float(min(reach, MAX_REACH_PX))

@@ -88,7 +88,7 @@ def painted_texture(painter: Inpainter, view: SceneViewCompletion, structure: Te
     hole = hole_mask(rendering.alpha, view.threshold)
     inverse_depth = known_inverse_depth(rendering.depth, hole)
     painted = painter.paint(rendering.rgb[None], hole[None], inverse_depth[None])
-    return pad_to_even(painted[0])
+    return pad_to_even(painted[0].to(rendering.rgb.device))
 
 
 def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
@@ -203,8 +203,8 @@ def continue_border(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     """
     features = view.features
     # Row and column of the nearest visible cell; negative if nothing is visible.
-    nearest = nearest_known_pixels(view.mask.numpy())  # [2, h, w]
-    row, column = torch.from_numpy(nearest).long().clamp_min(0)
+    nearest = nearest_known_pixels(view.mask)  # [2, h, w]
+    row, column = nearest.long().clamp_min(0)
     nearest_inverse_depth = features.inverse_depth[row, column].clamp_min(TINY)
     log_depth_ratio = (view.initial.inverse_depth / nearest_inverse_depth).log()
 

@@ -57,7 +57,7 @@ def rim_underlay(
     rim = around_holes[coarse]
     known = ~rim & ~open_cells[coarse]
     if not bool(rim.any()) or not bool(known.any()):
-        return Gaussians.empty()  # no rim, or nothing that could be continued beneath it
+        return Gaussians.empty(mask.device)  # no rim, or nothing that could be continued beneath it
 
     # The cells at a rim are filled anew, from all other cells: from the holes' filling on one side,
     # from visible surfaces on the other. Of these two, the farther one counts.

@@ -195,7 +195,7 @@ class Sample:
         return {}
 
     def network_input(self, names: tuple[str, ...]) -> Tensor:
-        """[1, C, h, w]: the named inputs of a network, on the CPU, kept for the next call."""
+        """[1, C, h, w]: the named inputs of a network, kept for the next call."""
         if names not in self._network_inputs:
             self._network_inputs[names] = self.view.network_input(names)
         return self._network_inputs[names]
@@ -207,7 +207,7 @@ class Sample:
 
     @functools.cached_property
     def tiles(self) -> Tensor:
-        """[ceil(H/16), ceil(W/16)] bool, on the CPU: the renderer's tiles that may change.
+        """[ceil(H/16), ceil(W/16)] bool: the renderer's tiles that may change.
 
         A tile of 16×16 pixels may change if it is near the hole, which aux Gaussians fill. In a
         view whose hole has fewer than 64 cells, the least opaque cells outside get aux Gaussians,
@@ -216,7 +216,7 @@ class Sample:
         height, width = self.rendering.alpha.shape
         cells = self.view.chosen_cells("masked")
         cell_pixels = cells.repeat_interleave(CELL, 0).repeat_interleave(CELL, 1)
-        filled = self.hole.cpu() | cell_pixels[:height, :width]
+        filled = self.hole | cell_pixels[:height, :width]
         near_filled = maximum_filter(filled, HOLE_REACH_PX)
         return max_pool2d(near_filled[None, None].float(), TILE_PX, ceil_mode=True)[0, 0] > 0
 
