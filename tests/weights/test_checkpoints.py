@@ -156,6 +156,7 @@ NAME = b"X\x01\x00\x00\x00a"
             "no named tensors",
         ),
         (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0fno", "not a file of weights"),
+        (b"\x80\x05\x96" + bytes(5) + b"\x01" + bytes(2) + b"no", "a bytearray"),  # of a terabyte
         (b"0" * 5_000_000, "too large"),
         (b"\x80\x02}r\xff\xff\xff\x7f.", "no named tensors"),  # a memo of 2 billion places
     ],

@@ -17,7 +17,7 @@ import os
 import pickle
 import struct
 import zipfile
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import torch
 from torch import Tensor
@@ -155,9 +155,19 @@ class _StandIn:
             self.fields.update(state)
 
 
+def _refuse_bytearray(unpickler: object) -> None:
+    """ValueError: Python would first take as much memory as the pickle says, and then read."""
+    raise ValueError("a bytearray, which PyTorch does not write")
+
+
 # The unpickler in Python; the one in C would allocate any amount of memory that a pickle asks for.
 class _PlainUnpickler(pickle._Unpickler):
     """Reads a pickle as plain values and stand-ins."""
+
+    dispatch: ClassVar[Any] = {
+        **pickle._Unpickler.dispatch,
+        pickle.BYTEARRAY8[0]: _refuse_bytearray,
+    }
 
     def find_class(self, module: str, name: str) -> type[_StandIn]:
         """Return a stand-in for a class or function that the pickle names."""
