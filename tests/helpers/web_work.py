@@ -10,6 +10,8 @@ from typing import Any
 
 from spackle.runtime.errors import InputError
 
+HUNGER_BYTES = 400_000_000  # that a photo of the name "hungry" takes, and each file of its scene
+
 
 def work(task: Any, tell: Any) -> None:
     """Write a scene with one layer, the photo's bytes; other files contain their name."""
@@ -17,6 +19,8 @@ def work(task: Any, tell: Any) -> None:
     how = job.name.partition(".")[0]
     if how == "full" and (job.folder.parent / "full").exists():
         raise InputError(f"{job.folder}: cannot write") from OSError(errno.ENOSPC, "disk full")
+    if how == "hungry":
+        bytearray(HUNGER_BYTES)
     if file is not None:
         if how == "endless" and file.endswith(".mp4"):
             tell({"stage": file, "done": 1, "total": 2})

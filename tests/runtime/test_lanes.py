@@ -26,6 +26,7 @@ from spackle.runtime.task_process import (
     TaskLimits,
     TaskProcess,
     machine_fault,
+    machine_memory,
 )
 
 
@@ -71,6 +72,20 @@ def test_memory_has_a_limit_that_ends_with_the_task(lane: Lane) -> None:
     assert too_much is not None
     assert too_much.kind == "memory"
     assert outcome(lane, "allocate", size) is None
+
+
+def test_the_memory_of_a_machine_is_that_of_its_container(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = (tmp_path / "memory.max", tmp_path / "missing")
+    monkeypatch.setattr("spackle.runtime.task_process.CONTAINER_LIMIT_FILES", files)
+    files[0].write_text("max\n")
+    whole = machine_memory()
+    if whole is None:
+        pytest.skip("this system does not say how much memory there is")
+    assert whole > 100_000_000
+    files[0].write_text("50000000\n")
+    assert machine_memory() == 50_000_000
 
 
 def test_orders_wait_in_line_and_end_with_their_owner(lane: Lane) -> None:

@@ -27,12 +27,13 @@ from helpers.web_client import (
     request,
     served,
 )
+from helpers.web_work import HUNGER_BYTES
 from PIL import Image
 
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import TaskLimits
 from spackle.web.failures import without_folders
-from spackle.web.jobs import Job
+from spackle.web.jobs import Job, RetentionLimits
 
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 WANTED_HEADERS = {"x-content-type-options", "content-security-policy", "cache-control"}
@@ -136,11 +137,27 @@ def test_a_file_that_nobody_waits_for_any_more_is_given_up(
 
 
 def test_a_file_has_a_limit_of_time(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spackle.web.jobs.FILE_LIMIT_S", 0.5)
     id = finished(server, "endless.png")
+    monkeypatch.setattr(server.jobs, "limits", RetentionLimits(work_s=0.5))
     reply = server.ask(f"{SCENES}/{id}/files/orbit.mp4")
     assert reply.status == 500
     assert reply.json["error"] == "orbit.mp4: took longer than 0.5 seconds, the limit"
+
+
+@needs_proc
+def test_a_scene_and_a_file_of_it_may_take_so_much_memory(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = "needs more memory than it may take"
+    id = finished(server, "hungry.png")
+    with monkeypatch.context() as patch:
+        patch.setattr("spackle.web.jobs.machine_memory", lambda: HUNGER_BYTES)
+        reply = server.ask(f"{SCENES}/{id}/files/scene.glb")
+        assert (reply.status, reply.json["error"]) == (500, f"scene.glb: {line}")
+        again = server.send(name="hungry.png").json["id"]
+        assert server.events(again)[-1]["error"] == f"hungry.png: {line}"
+    # The process that makes scenes lives on, without the limit.
+    assert finished(server, "hungry.png")
 
 
 def test_a_photo_whose_worker_was_killed_is_tried_once_more(server: Served) -> None:

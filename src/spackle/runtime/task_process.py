@@ -42,6 +42,11 @@ MACHINE_ERRORS = {
 }
 # Lists the size in pages of a process of Linux, its address space first.
 SIZE_FILE = Path("/proc/self/statm")
+# Files with the bytes that a container may take, in both versions of Linux's control groups.
+CONTAINER_LIMIT_FILES = (
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
 # Only on Linux, a process can be forked from a small server that has all modules imported already,
 # which takes 0.1 seconds in place of 5. Elsewhere that server, or its libraries, may not be forked.
 STARTS_QUICKLY = sys.platform.startswith("linux")
@@ -86,6 +91,22 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
+
+
+def machine_memory() -> int | None:
+    """The bytes of memory of this machine, or of the container that this process runs in.
+
+    None where the system does not say: the processes of such systems cannot be limited, either.
+    """
+    try:
+        sizes = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    except (AttributeError, ValueError, OSError):  # Windows
+        return None
+    for file in CONTAINER_LIMIT_FILES:
+        # The file may be missing, or say "max".
+        with contextlib.suppress(OSError, ValueError):
+            sizes.append(int(file.read_text()))
+    return min(sizes)
 
 
 def import_ahead(module: str) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import torch
 from fastapi import HTTPException
 from pydantic import BaseModel, Field
 
@@ -33,6 +34,7 @@ from spackle.runtime.task_process import (
     TaskLimits,
     import_ahead,
     machine_fault,
+    machine_memory,
 )
 from spackle.web.callbacks import CallbackSender
 from spackle.web.clients import OPERATOR, may_use
@@ -55,6 +57,9 @@ DECODER_COUNT = 2  # photos that are decoded at a time: a large one takes a giga
 # A photo of 100 megapixels takes a fifth of this time, and a third of this memory. The time by the
 # clock is for a decoder that waits for something.
 DECODING_LIMITS = TaskLimits(seconds=120, cpu_seconds=20, memory_bytes=4_000_000_000)
+# So much of the machine's memory the work on a scene, or on a file of it, may take; the server and
+# the system live on with what is left.
+SCENE_MEMORY_SHARE = 0.9
 # Seconds after which a file is given up that nobody waits for any more. A proxy that has lost its
 # patience, or a client that has lost its connection, asks again at once.
 ABANDONED_AFTER_S = 5.0
@@ -489,7 +494,7 @@ class Jobs:
             raise full_queue("files")
         if job.id not in self.by_id:  # it has been deleted in this moment
             raise HTTPException(404, "there is no such scene")
-        limits = TaskLimits(seconds=self.limits.work_s)
+        limits = scene_limits(self.limits.work_s)
 
         def add_file(order: Order) -> TaskFailure | None:
             return order.do((job, file), lambda event: file_order.note_event(event), limits)
@@ -592,7 +597,7 @@ class Jobs:
             line = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
             return TaskFailure("input", line)
         task = (job, None)  # None: the scene, not a further file of it
-        limits = TaskLimits(seconds=self.limits.work_s)
+        limits = scene_limits(self.limits.work_s)
         return order.do(task, lambda event: self._note_event(job.id, event), limits)
 
     def _end_or_repeat(self, job: Job, failure: TaskFailure | None, seconds: float) -> None:
@@ -698,6 +703,17 @@ class Jobs:
             if is_old or total_size > self.limits.size:
                 total_size -= sizes[id]
                 self.remove(id)
+
+
+def scene_limits(seconds: float) -> TaskLimits:
+    """What the work on a scene, or on a file of it, may take: some time, and most of the memory.
+
+    A GPU's driver reserves more addresses than a machine has memory, so with a GPU only the time is
+    limited; torch itself says when the GPU's memory is too small.
+    """
+    memory = None if torch.cuda.is_available() else machine_memory()
+    memory_bytes = None if memory is None else int(SCENE_MEMORY_SHARE * memory)
+    return TaskLimits(seconds=seconds, memory_bytes=memory_bytes)
 
 
 def error_line(name: str, failure: TaskFailure) -> str:
