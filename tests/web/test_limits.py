@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import io
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -231,6 +232,34 @@ def test_a_full_disk_at_an_upload_is_507_with_all_headers_and_leaves_nothing(
     assert set(reply.headers) >= WANTED_HEADERS
     assert str(server.jobs.folder) not in reply.json["error"]
     assert set(server.jobs.folder.iterdir()) == before
+
+
+def test_a_slow_disk_holds_up_nobody(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    changes_in_loop: list[str] = []
+    change_count = 0
+
+    def watched(name: str) -> Callable[..., Any]:
+        """A function of `os`, which notes whether an event loop waits for it."""
+        change = getattr(os, name)
+
+        def note(*arguments: Any, **options: Any) -> Any:
+            nonlocal change_count
+            change_count += 1
+            with contextlib.suppress(RuntimeError):
+                asyncio.get_running_loop()
+                changes_in_loop.append(f"{name} {arguments[0]}")
+            return change(*arguments, **options)
+
+        return note
+
+    for name in ("mkdir", "rename", "replace", "rmdir", "unlink"):
+        monkeypatch.setattr(os, name, watched(name))
+    id = finished(server, "photo.png")
+    assert server.ask(f"{SCENES}/{id}/files/scene.glb").status == 200
+    assert server.ask(f"{SCENES}/{id}", "DELETE").status == 204
+    assert server.send(b"no photo").status == 415
+    assert change_count > 5
+    assert changes_in_loop == []
 
 
 def test_a_fault_of_the_server_leaves_by_the_same_door(

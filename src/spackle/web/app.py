@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import uvicorn
 from fastapi import Depends, FastAPI, Header, Query, Request
+from fastapi.concurrency import contextmanager_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import (
     FileResponse,
@@ -532,28 +533,35 @@ class SceneHandlers:
         client = client_of(request.scope)
         # The place is reserved first, so that a refused photo is not even received.
         check_form_type(request)
-        with (
-            self.rates.count_photo(client),
-            as_no_space(),
-            self.jobs.reserve_place() as upload_folder,
-        ):
-            try:
-                # Two files, such as the photo and its depth map. Two text fields: the options, and
-                # the address to call at the end.
-                reading = request.form(max_files=2, max_fields=2)
-                form = await asyncio.wait_for(reading, MAX_UPLOAD_S)
-            except asyncio.TimeoutError:
-                raise HTTPException(408, "the photo arrived too slowly") from None
-            try:
-                # Every form may have this field.
-                callback_url = self.jobs.callbacks.check(form.get("callback_url"))
-                submission = Submission(client, key, callback_url)
-                async with self.decoding:
-                    return await run_in_threadpool(
-                        accept, form, upload_folder, self.jobs, submission
-                    )
-            finally:
-                await form.close()
+        # Folders are made and deleted in a thread: a busy disk must hold up nobody else.
+        with self.rates.count_photo(client), as_no_space():
+            async with contextmanager_in_threadpool(self.jobs.reserve_place()) as upload_folder:
+                return await self._receive_into(upload_folder, request, accept, client, key)
+
+    async def _receive_into(
+        self,
+        upload_folder: Path,
+        request: Request,
+        accept: Callable[..., Job],
+        client: str,
+        key: RequestKey | None,
+    ) -> Job:
+        """The new job of a form that comes from a client into an empty folder; see `_accept`."""
+        try:
+            # Two files, such as the photo and its depth map. Two text fields: the options, and
+            # the address to call at the end.
+            reading = request.form(max_files=2, max_fields=2)
+            form = await asyncio.wait_for(reading, MAX_UPLOAD_S)
+        except asyncio.TimeoutError:
+            raise HTTPException(408, "the photo arrived too slowly") from None
+        try:
+            # Every form may have this field.
+            callback_url = self.jobs.callbacks.check(form.get("callback_url"))
+            submission = Submission(client, key, callback_url)
+            async with self.decoding:
+                return await run_in_threadpool(accept, form, upload_folder, self.jobs, submission)
+        finally:
+            await form.close()
 
     @staticmethod
     def _root(request: Request) -> str:
