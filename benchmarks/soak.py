@@ -10,6 +10,7 @@ photos: what is tested is the server. Uploads are decoded for real.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import http.client
 import io
@@ -26,7 +27,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from PIL import Image
 
@@ -43,6 +44,10 @@ PROBE_S = 0.1  # seconds between two requests of /healthz
 MEMORY_PROBE_S = 2.0
 MAX_WAITING = 8  # jobs that are sent and not done yet
 DISK_FULL_S = 5.0
+LOOP_FILE = "loop.json"  # beside the folder of scenes: what the server says at its end
+SLOW_STEP_MS = 5.0  # a step of the event loop whose name is kept
+MAX_STEP_NAME = 300  # characters
+SLOWEST_STEPS = 8
 
 
 # --- The server
@@ -74,10 +79,43 @@ def serve(folder: Path, port: int) -> None:
     from spackle.web.guard import Access
 
     jobs.RETRY_S = 2.0  # so that the soak need not wait for half a minute
+    loop_steps = time_loop_steps()
+    # The server raises the signal that has ended it once more; the report is still to be written.
+    signal.signal(signal.SIGTERM, lambda number, frame: None)
     access = Access.for_listener("127.0.0.1", "127.0.0.1", TOKEN)
     app = create_app(folder, pretend, workers=2, access=access)
     with socket.create_server(("127.0.0.1", port)) as listener:
         make_server(app).run(sockets=[listener])
+    slowest = sorted(loop_steps, reverse=True)[:SLOWEST_STEPS]
+    cpu_ms = [step.cpu_ms for step in loop_steps]
+    report = {
+        "steps of the event loop, ms of the processor": summary(cpu_ms),
+        "the slowest ones": [f"{step.cpu_ms:.0f} ms: {step.name}" for step in slowest],
+    }
+    (folder.parent / LOOP_FILE).write_text(json.dumps(report))
+
+
+class LoopStep(NamedTuple):
+    """What the event loop does at a stretch, during which it answers nobody."""
+
+    cpu_ms: float  # milliseconds of the processor, whatever else runs on the machine
+    name: str
+
+
+def time_loop_steps() -> list[LoopStep]:
+    """A list to which each step of an event loop of this process will be added."""
+    steps: list[LoopStep] = []
+    run = asyncio.Handle._run
+
+    def run_timed(handle: Any) -> None:
+        start = time.thread_time()
+        run(handle)
+        cpu_ms = 1000 * (time.thread_time() - start)
+        name = repr(handle)[:MAX_STEP_NAME] if cpu_ms > SLOW_STEP_MS else ""
+        steps.append(LoopStep(cpu_ms, name))
+
+    asyncio.Handle._run = run_timed  # type: ignore[method-assign]
+    return steps
 
 
 # --- Inputs
@@ -312,6 +350,10 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
         ends = {id: (disk / "scenes" / id / "ends").read_text() for id in states}
         temporary = list((disk / "scenes").rglob(".*.*"))
         workers = len(children_of(server.pid))
+        # The server says at its end what its event loop has done.
+        server.terminate()
+        server.wait(60)
+        loop_report = json.loads((disk / LOOP_FILE).read_text())
     third = max(1, len(watcher.megabytes) // 3)
     return {
         "jobs sent": sent,
@@ -332,6 +374,7 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
         "seconds of the slowest refusal": round(max(refused_bombs, default=0), 1),
         "healthz, ms": summary(watcher.health_ms),
         "a thread of the client wakes up late by, ms": summary(watcher.late_ms),
+        **loop_report,
         "server, MB": {
             "first third": round(sum(watcher.megabytes[:third]) / third),
             "last third": round(sum(watcher.megabytes[-third:]) / third),
