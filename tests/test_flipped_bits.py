@@ -36,7 +36,7 @@ from spackle.paper.training.checkpoint import (
 from spackle.paper.training.samples import Sample, load_sample, save_sample
 from spackle.posed.kept_predictions import KeptPredictions
 from spackle.render import CpuRenderer
-from spackle.runtime.digests import json_digest, sealed, unsealed
+from spackle.runtime.digests import sealed, signed, unsealed
 from spackle.runtime.errors import InputError
 from spackle.runtime.tensor_digests import tree_digest
 
@@ -102,7 +102,7 @@ def crop_count(folder: Path) -> tuple[Path, Callable[[], Any]]:
     for number in range(2):
         (folder / f"000000-{number}.safetensors").touch()
     path = folder / "000000.done"
-    path.write_text(sample_factory._count_line(2))
+    path.write_bytes(sealed(b"2\n"))
     return (
         path,
         lambda: (
@@ -140,8 +140,7 @@ def image_numbers(folder: Path) -> tuple[Path, Callable[[], Any]]:
     path = folder / "00000-a.json"
     rows = [image_measurement("data", "a", f"metric {k}", 0.125 * k) for k in range(20)]
     content: dict[str, Any] = {"inputs": "digest", "files": {}, "rows": rows}
-    content["sha256"] = json_digest(content)
-    path.write_text(json.dumps(content) + "\n")
+    path.write_text(json.dumps(signed(content)) + "\n")
 
     def read() -> Any:
         found = _load_image_results(path, "digest")
@@ -189,7 +188,7 @@ def test_files_of_older_versions_without_a_digest_are_still_read(
     assert [line.split(": ")[1].split(",")[0] for line in lines] == ["of an older version"]
 
     with monkeypatch.context() as patch:
-        patch.setattr(samples, "save", lambda tensors, metadata: save(tensors))
+        patch.setattr(samples, "signed_tensors", save)
         path, _ = sample(tmp_path)
     assert torch.equal(load_sample(path).target, a_sample_target(path))
     sample_factory._warn_of_old_files(tmp_path, lines.append)

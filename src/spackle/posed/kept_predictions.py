@@ -8,15 +8,14 @@ import shutil
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
 
 from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import make_folder
-from spackle.runtime.tensor_digests import tree_digest
+from spackle.runtime.tensor_digests import read_signed_tensors, signed_tensors
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -32,14 +31,8 @@ class KeptPredictions:
         path = self.folder / f"{key}.safetensors"
         # A damaged file is no error: the photo is simply predicted again.
         try:
-            with safe_open(path, "pt") as file:
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-                metadata = file.metadata()
-            facts = json.loads(metadata["facts"])
-            # A bit may have flipped. Files of older versions have no digest.
-            digest = tree_digest([tensors, facts])
-            if metadata.get("sha256", digest) != digest:
-                return None
+            tensors = read_signed_tensors(path)
+            facts = json.loads(tensors["facts"])
             camera = Camera(tensors["K"], torch.eye(4), facts["width"], facts["height"])
             prediction = BasePrediction(
                 Gaussians(*(tensors[name] for name in FIELDS)),
@@ -69,8 +62,7 @@ class KeptPredictions:
             "is_metric": prediction.is_metric,
             "base": base_name,
         }
-        metadata = {"facts": json.dumps(facts), "sha256": tree_digest([tensors, facts])}
-        content = save(tensors, metadata=metadata)
+        content = signed_tensors(tensors, {"facts": json.dumps(facts)})
         write_atomic(self.folder / f"{key}.safetensors", content)
 
     def remove(self) -> None:

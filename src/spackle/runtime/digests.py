@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,7 +14,10 @@ from spackle.runtime.files import check_file
 
 HASH_BLOCK_BYTES = 1 << 20  # read at once, so that a large file needs little memory
 MAX_HASHED_BYTES = 200_000_000  # hashing takes a second; a larger file is known by size and time
+DIGEST_KEY = "sha256"  # of the digest of a mapping, beside its other values
 SEAL = b"spackle sha256 "  # begins a file with a digest of all that follows the first line
+
+DigestOf = Callable[[Any], str]  # such as `json_digest`
 
 
 def sha256_of(file: BinaryIO) -> str:
@@ -28,6 +31,24 @@ def sha256_of(file: BinaryIO) -> str:
 def json_digest(value: object) -> str:
     """SHA-256, in hexadecimal digits, of a value as JSON; the order of keys does not matter."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def signed(content: Mapping[str, Any], digest_of: DigestOf = json_digest) -> dict[str, Any]:
+    """The content and its digest, for a file that a later run trusts; `unsigned` checks it."""
+    return {**content, DIGEST_KEY: digest_of(content)}
+
+
+def unsigned(content: Mapping[str, Any], digest_of: DigestOf = json_digest) -> dict[str, Any]:
+    """The content that `signed` was given; content without a digest, of older versions, as it is.
+
+    Raises:
+        ValueError: the content is not the one that was signed.
+    """
+    plain = dict(content)
+    stated_digest = plain.pop(DIGEST_KEY, None)
+    if stated_digest is not None and stated_digest != digest_of(plain):
+        raise ValueError("damaged: its digest is another one")
+    return plain
 
 
 def sealed(content: bytes) -> bytes:

@@ -3,10 +3,55 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Mapping
 from typing import Any
 
 import torch
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor
+
+from spackle.runtime.digests import DIGEST_KEY, signed, unsigned
+
+NO_TEXTS: Mapping[str, str] = {}
+
+
+def signed_tensors(tensors: Mapping[str, Tensor], texts: Mapping[str, str] = NO_TEXTS) -> bytes:
+    """The content of a safetensors file that `read_signed_tensors` checks.
+
+    Args:
+        tensors: by name.
+        texts: further values by name, which are no tensors' names.
+    """
+    digest = signed({**tensors, **texts}, tree_digest)[DIGEST_KEY]
+    return save(dict(tensors), metadata={**texts, DIGEST_KEY: digest})
+
+
+def read_signed_tensors(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The tensors and texts in a file of `signed_tensors`, by name.
+
+    A file of an older version has no digest, and is read as it is.
+
+    Raises:
+        ValueError: a bit has flipped.
+        OSError, SafetensorError: the file is missing or broken.
+    """
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        texts: dict[str, str] = file.metadata() or {}
+    return unsigned({**tensors, **texts}, tree_digest)
+
+
+def stated_digest(path: str | os.PathLike[str]) -> str | None:
+    """The digest that a safetensors file states; None if it states none, as of an older version.
+
+    Raises:
+        OSError, SafetensorError: the file is missing or broken.
+    """
+    with safe_open(path, framework="pt") as file:
+        texts: dict[str, str] = file.metadata() or {}
+    return texts.get(DIGEST_KEY)
 
 
 def tree_digest(value: Any) -> str:

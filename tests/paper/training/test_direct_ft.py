@@ -22,7 +22,6 @@ from spackle.bases.sharp.base import expected_shapes
 from spackle.bases.sharp.encoder import MICRO_SIZE
 from spackle.paper.dataset import DatasetFiles
 from spackle.paper.dataset.shards import load_manifest
-from spackle.paper.training.checkpoint import DIGEST_KEY
 from spackle.paper.training.direct_ft import (
     VIEWS_PER_PHOTO,
     DirectFt,
@@ -33,6 +32,7 @@ from spackle.paper.training.direct_ft import (
 )
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.render import get_renderer
+from spackle.runtime.digests import DIGEST_KEY
 
 __all__ = ["one_thread"]  # a fixture
 

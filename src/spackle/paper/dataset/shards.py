@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, model_validator
 from torch.utils.data import Dataset
 
 from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
-from spackle.runtime.digests import json_digest, unsealed
+from spackle.runtime.digests import json_digest, signed, unsealed
 from spackle.runtime.errors import InputError, as_input_error, reason_in_a_line
 from spackle.runtime.files import atomic_path
 
@@ -93,9 +93,7 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 
         The digest of its content is part of the file.
         """
-        content = self._content()
-        signed_content = {**content, "sha256": json_digest(content)}
-        text = json.dumps(signed_content, indent=1, sort_keys=True, allow_nan=False)
+        text = json.dumps(signed(self._content()), indent=1, sort_keys=True, allow_nan=False)
         with atomic_path(folder / MANIFEST_NAME) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 

@@ -36,6 +36,8 @@ from spackle.runtime.digests import (
     json_digest,
     matches_records,
     photo_digest,
+    signed,
+    unsigned,
 )
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import (
@@ -199,8 +201,8 @@ class ImageWorker:
             "files": file_records(results_path.parent, results.files),
             "rows": results.measurements,
         }
-        content["sha256"] = json_digest(content)
-        write_atomic(results_path, (json.dumps(content, allow_nan=False) + "\n").encode())
+        text = json.dumps(signed(content), allow_nan=False)
+        write_atomic(results_path, f"{text}\n".encode())
         reporter.detail(f"  {case.name}: {time.perf_counter() - start:.1f} s")
         return ImageDone(job.index, results.measurements, reporter.said)
 
@@ -360,11 +362,8 @@ def _load_image_results(path: Path, inputs_digest: str) -> list[Measurement] | N
     """
     # A file that is missing, or damaged in any way, counts as not measured.
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        content = json.loads(path.read_text("utf-8"))
-        # A flipped bit makes another number; files of older versions have no digest.
-        digest = content.pop("sha256", None)
-        if digest is not None and digest != json_digest(content):
-            return None
+        # A flipped bit makes another number.
+        content = unsigned(json.loads(path.read_text("utf-8")))
         # A benchmark saves no pictures, so there is nothing to compare.
         pictures_match = not content["files"] or matches_records(
             path.parent, path.name, content["files"]

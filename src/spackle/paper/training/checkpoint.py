@@ -15,6 +15,7 @@ from torch import Tensor
 
 from spackle.paper.training.recipe import AnyRecipe, changed_keys
 from spackle.paper.training.run_logs import LOGS_FOLDER, METRICS_FILE
+from spackle.runtime.digests import DIGEST_KEY, signed, unsigned
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path
 from spackle.runtime.tensor_digests import tree_digest
@@ -24,7 +25,6 @@ BEST_WEIGHTS = "best.safetensors"  # the averaged weights of the best validation
 LAST_WEIGHTS = "last.safetensors"  # the averaged weights of the last save
 RUN_REPORT = "run.json"
 RUN_FILES = (CHECKPOINT_FILE, BEST_WEIGHTS, LAST_WEIGHTS, RUN_REPORT, METRICS_FILE)
-DIGEST_KEY = "sha256"  # of a checkpoint's digest, beside the fields of `Checkpoint`
 PICTURES_FOLDER = "pictures"  # one picture a validation
 Log = Callable[[str], None]  # prints a line
 
@@ -93,11 +93,9 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     If the disk is full, InputError, and the previous checkpoint stays.
     """
     state = {**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}
-    state[DIGEST_KEY] = tree_digest(state)
-
     # torch.save to a file would hide that the disk is full, so the bytes are made in memory.
     buffer = io.BytesIO()
-    torch.save(state, buffer)
+    torch.save(signed(state, tree_digest), buffer)
     with atomic_path(folder / CHECKPOINT_FILE) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
@@ -112,13 +110,10 @@ def load_checkpoint(folder: Path, log: Log | None = None) -> Checkpoint | None:
         return None
     with as_input_error(path, "cannot be read ({reason}): `overwrite` starts a new run"):
         state = torch.load(path, map_location="cpu", weights_only=True)
+        if DIGEST_KEY not in state and log is not None:
+            log(f"{path}: of an older version, without a digest that would show damage")
         # One flipped bit would silently train on with other weights.
-        digest = state.pop(DIGEST_KEY, None)
-        if digest is None:
-            if log is not None:
-                log(f"{path}: of an older version, without a digest that would show damage")
-        elif digest != tree_digest(state):
-            raise ValueError("damaged: its digest is another one")
+        state = unsigned(state, tree_digest)
         progress = TrainingProgress(**state.pop("progress"))
         return Checkpoint(progress=progress, **state)
 

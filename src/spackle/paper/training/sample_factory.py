@@ -12,11 +12,13 @@ import numpy as np
 
 from spackle.paper.training.ranks import rank, rank_count, wait_for_ranks
 from spackle.paper.training.recipe import DataRecipe
-from spackle.paper.training.samples import Sample, random_crops, sample_digest, save_sample
+from spackle.paper.training.samples import Sample, random_crops, save_sample
 from spackle.residual.features import CELL
+from spackle.runtime.digests import sealed, unsealed
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Progress
+from spackle.runtime.tensor_digests import stated_digest
 
 SAMPLES_VERSION = 8  # increase this whenever a recipe would give different samples
 
@@ -103,7 +105,7 @@ def make_samples(
             for number, crop in enumerate(crops):
                 save_sample(crop, _crop_file(folder, index, number))
             # Written after all crops, so that its presence proves that they are complete.
-            write_atomic(_count_file(folder, index), _count_line(len(crops)).encode())
+            write_atomic(_count_file(folder, index), sealed(b"%d\n" % len(crops)))
         progress(index - first + 1, stop - first)
     wait_for_ranks()
 
@@ -124,7 +126,7 @@ def _warn_of_old_files(folder: Path, warn: Callable[[str], None]) -> None:
         return
     # A damaged file is reported when it is read.
     with contextlib.suppress(Exception):
-        if sample_digest(first_file) is None:
+        if stated_digest(first_file) is None:
             warn(f"{folder}: samples of an older version, without digests that would show damage")
 
 
@@ -187,21 +189,14 @@ def _count_file(folder: Path, index: int) -> Path:
     return folder / f"{index:06d}.done"
 
 
-def _count_line(count: int) -> str:
-    """The content of the file that holds the number of a view's crops: number and digest."""
-    return f"{count} {short_digest(count)}\n"
-
-
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
     """The files of a view's crops, perhaps none; None if the crops are not complete."""
     # The file with the number of crops is written last, so that it is missing after a killed run.
     try:
-        line = _count_file(folder, index).read_text()
-        count = int(line.split()[0])
+        # A damaged number would leave crops out. Older files may have another text after it.
+        content = unsealed(_count_file(folder, index).read_bytes())
+        count = int(content.split()[0])
     except (FileNotFoundError, ValueError, IndexError):
-        return None
-    # A damaged number would leave crops out; older files have the number alone.
-    if line not in (_count_line(count), f"{count}\n"):
         return None
     files = [_crop_file(folder, index, number) for number in range(count)]
     return files if all(file.is_file() for file in files) else None

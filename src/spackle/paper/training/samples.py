@@ -10,12 +10,10 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
-from safetensors import safe_open
-from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -29,10 +27,9 @@ from spackle.residual.features import CELL, ViewFeatures, cell_centers, hole_mas
 from spackle.residual.initializer import InitialGaussians
 from spackle.runtime.errors import as_input_error
 from spackle.runtime.files import write_atomic
-from spackle.runtime.tensor_digests import tree_digest
+from spackle.runtime.tensor_digests import read_signed_tensors, signed_tensors
 from spackle.scene_fill.view_completion import FarRim, SceneViewCompletion
 
-DIGEST_KEY = "sha256"  # of the digest in the metadata of a sample's file
 HOLE_REACH_PX = 16  # aux Gaussians, which fill a hole, reach at most so many pixels beyond the hole
 # The names of a sample's tensors in its file, and their places in a `Sample`. Two prefixes are
 # older than the present names of the fields.
@@ -342,7 +339,7 @@ def save_sample(sample: Sample, path: Path) -> None:
         if tensor.dtype == torch.float32 and name not in FLOAT32_TENSORS:
             tensors[name] = tensor.half()
     tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
-    write_atomic(path, save(tensors, metadata={DIGEST_KEY: tree_digest(tensors)}))
+    write_atomic(path, signed_tensors(tensors))
 
 
 def load_sample(path: str | os.PathLike[str]) -> Sample:
@@ -350,12 +347,7 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
     with as_input_error(
         path, "not a training sample, or damaged: delete the file; the next run makes it again"
     ):
-        with safe_open(path, framework="pt") as file:
-            stored_tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            digest = _stated_digest(file)
-        # Files of older versions have no digest.
-        if digest is not None and digest != tree_digest(stored_tensors):
-            raise ValueError("its digest is another one")
+        stored_tensors = read_signed_tensors(path)
         tensors = {name: _to_float(name, tensor) for name, tensor in stored_tensors.items()}
         tensors["base.colors"] = srgb_to_linear(tensors["base.colors"])
         width, height = tensors["camera.size"].tolist()
@@ -381,22 +373,6 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
             surroundings=HoleSurroundings(**fields["surroundings"]),
             target=tensors["target"],
         )
-
-
-def sample_digest(path: str | os.PathLike[str]) -> str | None:
-    """The digest of its tensors that a sample's file states; None if it states none.
-
-    Raises:
-        Exception: the file is missing or broken.
-    """
-    with safe_open(path, framework="pt") as file:
-        return _stated_digest(file)
-
-
-def _stated_digest(file: Any) -> str | None:
-    """The digest that an open safetensors file states; None if it states none."""
-    metadata: dict[str, str] | None = file.metadata()
-    return None if metadata is None else metadata.get(DIGEST_KEY)
 
 
 def _to_float(name: str, tensor: Tensor) -> Tensor:
