@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import gc
 import http.client
 import io
 import json
@@ -27,7 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from PIL import Image
 
@@ -45,9 +46,6 @@ MEMORY_PROBE_S = 2.0
 MAX_WAITING = 8  # jobs that are sent and not done yet
 DISK_FULL_S = 5.0
 LOOP_FILE = "loop.json"  # beside the folder of scenes: what the server says at its end
-SLOW_STEP_MS = 5.0  # a step of the event loop whose name is kept
-MAX_STEP_NAME = 300  # characters
-SLOWEST_STEPS = 8
 
 
 # --- The server
@@ -75,47 +73,60 @@ def pretend(task: Any, send_event: Any) -> None:
 def serve(folder: Path, port: int) -> None:
     """Run the server until it is stopped."""
     from spackle.web import jobs
-    from spackle.web.app import create_app, make_server
+    from spackle.web.app import create_app
     from spackle.web.guard import Access
+    from spackle.web.local_server import answer_requests
 
     jobs.RETRY_S = 2.0  # so that the soak need not wait for half a minute
     loop_steps = time_loop_steps()
+    collections = time_collections()
     # The server raises the signal that has ended it once more; the report is still to be written.
     signal.signal(signal.SIGTERM, lambda number, frame: None)
     access = Access.for_listener("127.0.0.1", "127.0.0.1", TOKEN)
     app = create_app(folder, pretend, workers=2, access=access)
     with socket.create_server(("127.0.0.1", port)) as listener:
-        make_server(app).run(sockets=[listener])
-    slowest = sorted(loop_steps, reverse=True)[:SLOWEST_STEPS]
-    cpu_ms = [step.cpu_ms for step in loop_steps]
+        answer_requests(app, listener)
     report = {
-        "steps of the event loop, ms of the processor": summary(cpu_ms),
-        "the slowest ones": [f"{step.cpu_ms:.0f} ms: {step.name}" for step in slowest],
+        "steps of the event loop, ms of the processor": summary(loop_steps),
+        "collections of garbage, ms of the processor": summary(collections),
     }
     (folder.parent / LOOP_FILE).write_text(json.dumps(report))
 
 
-class LoopStep(NamedTuple):
-    """What the event loop does at a stretch, during which it answers nobody."""
+def time_loop_steps() -> list[float]:
+    """A list to which the milliseconds of each step of this process's event loop will be added.
 
-    cpu_ms: float  # milliseconds of the processor, whatever else runs on the machine
-    name: str
-
-
-def time_loop_steps() -> list[LoopStep]:
-    """A list to which each step of an event loop of this process will be added."""
-    steps: list[LoopStep] = []
+    During a step nobody is answered. Milliseconds are those of the processor, whatever else runs
+    on the machine.
+    """
+    milliseconds: list[float] = []
     run = asyncio.Handle._run
 
     def run_timed(handle: Any) -> None:
         start = time.thread_time()
         run(handle)
-        cpu_ms = 1000 * (time.thread_time() - start)
-        name = repr(handle)[:MAX_STEP_NAME] if cpu_ms > SLOW_STEP_MS else ""
-        steps.append(LoopStep(cpu_ms, name))
+        milliseconds.append(1000 * (time.thread_time() - start))
 
     asyncio.Handle._run = run_timed  # type: ignore[method-assign]
-    return steps
+    return milliseconds
+
+
+def time_collections() -> list[float]:
+    """A list to which the milliseconds of each collection of garbage will be added.
+
+    No thread of the process does anything meanwhile. Milliseconds are those of the processor.
+    """
+    milliseconds: list[float] = []
+    starts: list[float] = []
+
+    def note(phase: str, facts: object) -> None:
+        if phase == "start":
+            starts.append(time.thread_time())
+        elif starts:
+            milliseconds.append(1000 * (time.thread_time() - starts.pop()))
+
+    gc.callbacks.append(note)
+    return milliseconds
 
 
 # --- Inputs

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,12 +11,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from helpers.command import run
 from helpers.web_client import PHOTO, SCENES, Served, eventually, form, served
 
 import spackle
 from spackle.runtime.errors import InputError
 from spackle.web.jobs import RetentionLimits, SceneState
+from spackle.web.local_server import answer_requests
 from spackle.web.public_address import PublicAddress
 
 
@@ -71,6 +75,22 @@ def test_a_photo_that_takes_too_long_fails_and_the_next_one_begins(tmp_path: Pat
         assert slow["error"] == "slow.png: took longer than 1 seconds, the limit"
         server.jobs.limits = RetentionLimits(work_s=60)
         assert server.events(server.send().json["id"])[-1]["state"] == "done"
+
+
+def test_no_collection_of_garbage_looks_through_imported_modules_while_a_server_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    passed_over: list[int] = []
+
+    class Server:
+        def run(self, sockets: list[socket.socket]) -> None:
+            passed_over.append(gc.get_freeze_count())
+
+    monkeypatch.setattr("spackle.web.local_server.make_server", lambda app: Server())
+    with socket.socket() as listener:
+        answer_requests(FastAPI(), listener)
+    assert passed_over[0] > 100_000
+    assert gc.get_freeze_count() == 0
 
 
 def test_the_command_without_options_has_the_limits_of_python(
