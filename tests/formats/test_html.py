@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import gzip
 import hashlib
 import json
 import math
@@ -23,6 +24,7 @@ from spackle.formats.html import (
     encode_harmonics,
     encode_layer,
     page_scene,
+    read_page_file,
     single_html,
 )
 
@@ -125,6 +127,11 @@ def test_the_eye_goes_as_far_as_the_scene_was_completed(
     assert (orbit["free"], orbit["limit"]) == (free, free)
 
 
+def digest_of(text: str) -> str:
+    """The digest by which a policy names a script or a style."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
 def test_the_single_file_runs_its_own_script_and_style_alone() -> None:
     page = single_html(page_scene(EVIL, BOX.base(), Gaussians.empty(), BOX.camera))
     assert page == single_html(page_scene(EVIL, BOX.base(), Gaussians.empty(), BOX.camera))
@@ -138,5 +145,12 @@ def test_the_single_file_runs_its_own_script_and_style_alone() -> None:
     assert "unsafe-inline" not in policy
     for element in ("script", "style"):
         (text,) = re.findall(rf"<{element}>(.*?)</{element}>", page.decode(), re.DOTALL)
-        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        assert f"'sha256-{digest}'" in policy
+        assert digest_of(text) in policy
+    # The viewer travels packed.
+    (packed,) = re.findall(rb'<script type="text/plain" id="spackle-viewer">(.*?)</script>', page)
+    viewer = gzip.decompress(base64.b64decode(packed)).decode()
+    assert viewer == read_page_file("viewer.js").decode()
+    assert digest_of(viewer) in policy
+    assert len(packed) < 0.7 * len(viewer)
+    licences = read_page_file("licenses.txt")
+    assert licences.strip() in page  # to be read by whoever opens the file

@@ -54,7 +54,8 @@ def opened(browser: Any, url: str, script: Path | None = None, **screen: Any) ->
 
 def settled(page: Any, promise: str) -> None:
     """Wait for a promise of the page, with a timeout (`evaluate` has none)."""
-    page.wait_for_function(f"{promise}.then(() => true)")
+    # The script of a page that was sent is unpacked first.
+    page.wait_for_function(f"window.spackle && {promise}.then(() => true)")
 
 
 def pixels(png: bytes) -> Tensor:

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.browser import opened, pixels, settled
@@ -70,6 +71,17 @@ def test_a_sent_page_takes_less_than_half_and_looks_the_same(browser: Any, tmp_p
         assert psnr(pixels(base64.b64decode(url.partition(",")[2])), exact) > 40
     assert found.said == []
     found.page.context.close()
+
+
+def test_surfaces_that_nearly_touch_keep_their_order() -> None:
+    pair = hills().select(slice(0, 2))
+    pair.means[1] = pair.means[0] * (1 + 1 / 8000)  # right behind the other, as seen by the camera
+    layer, _, _ = encode_layer(pair)
+    lens = {"K": CAMERA.K.tolist(), "width": CAMERA.width, "height": CAMERA.height}
+    compact = compact_layer(layer, lens)
+    assert compact is not None
+    low_bytes_of_depth_step = np.frombuffer(compact, np.uint8).reshape(20, 2)[6]
+    assert low_bytes_of_depth_step[1] in (2, 4)  # one or two steps farther
 
 
 @pytest.mark.parametrize("center", [(0.0, 0.0, -1.0), (1e6, 0.0, 1e-3)])

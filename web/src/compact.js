@@ -1,9 +1,9 @@
 // Layers as src/spackle/formats/compact_layer.py writes them, back in the planes that splats.js reads.
 const STEPS_PER_LONG_SIDE = 8 * 1536;
-const DEPTH_STEPS_PER_E = 3072;
+const DEPTH_STEPS_PER_E = 12288;
 const SCALE_SHIFT = 2;
-const QUATERNION_SHIFT = 3;
-const COLOR_SHIFT = 1;
+const QUATERNION_SHIFT = 4;
+const COLOR_SHIFT = 2;
 
 /** The 20 planes of `count` Gaussians; `camera` is the description's. */
 export function expand(bytes, count, { K, width, height }) {

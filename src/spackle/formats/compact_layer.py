@@ -17,16 +17,18 @@ CENTER_PLANES = 9
 
 # A centre is kept to a share of the picture's long side: an eighth of a pixel of 1536.
 STEPS_PER_LONG_SIDE = 8 * 1536
-# The depth is kept to a sixth of a thousandth: surfaces that nearly touch keep their order. With a
-# step of a thousandth, the picture of a test photo changed by 39 dB, with this one by 43 dB.
-DEPTH_STEPS_PER_E = 3072  # steps while the depth grows e-fold
+# The depth is kept to a twelfth of a thousandth, so that surfaces that nearly touch keep their
+# order: nothing else changes the picture as much. A photo of leaves with 1.15 million Gaussians
+# differs from the exact picture by 40 dB, and by 34 dB with a quarter of these steps.
+DEPTH_STEPS_PER_E = 12288  # steps while the depth grows e-fold
 # Whole numbers of three bytes must be able to hold a difference.
 MAX_STEP = 1 << 21
 
-# Bits that a byte loses.
+# Bits that a byte loses. Colours are half of the bytes. With one bit more of the colours and the
+# rotations, that photo's page would have 19 % more bytes, for 2 dB.
 SCALE_SHIFT = 2
-QUATERNION_SHIFT = 3
-COLOR_SHIFT = 1
+QUATERNION_SHIFT = 4
+COLOR_SHIFT = 2
 
 
 def compact_layer(layer: bytes, lens: Mapping[str, Any]) -> bytes | None:

@@ -81,6 +81,7 @@ ICON_TAG = '<link rel="icon" href="data:,">'
 PHOTO_TAG = '<img id="photo"'
 STYLE_TAG = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT_TAG = '<script src="viewer.js" defer></script>'
+LICENCES_END = "*/"  # of the comment with which viewer.js begins
 
 # The end of a file's name, such as ".jpg", which a title does not show; but not of "Mt. Blanc".
 FILE_SUFFIX = r"(?<=.)\.[^.\s]{1,5}$"
@@ -406,7 +407,10 @@ def single_html(scene: PageScene, caption: str = "", preview: Tensor | None = No
     """
     page = read_page_file("index.html").decode()
     css = read_page_file("viewer.css").decode() + read_page_file("gift.css").decode()
-    js = read_page_file("viewer.js").decode()
+    viewer = read_page_file("viewer.js").decode()
+    # The licences of what the viewer is made of stay readable.
+    licences = viewer[: viewer.index(LICENCES_END) + len(LICENCES_END)]
+    unpack = f"{licences}\n{read_page_file('unpack.js').decode()}"
 
     files, compact_files = _files_to_send(scene)
     embedded_files = {}
@@ -422,14 +426,17 @@ def single_html(scene: PageScene, caption: str = "", preview: Tensor | None = No
     # The page's own script and style, which are named by their digests, are allowed. The script
     # may compile WebAssembly, start workers, and show images and videos that it has made.
     policy = (
-        f"default-src 'none'; script-src {_policy_digest(js)} 'wasm-unsafe-eval'; "
+        f"default-src 'none'; script-src {_policy_digest(unpack)} {_policy_digest(viewer)} "
+        "'wasm-unsafe-eval'; "
         f"style-src {_policy_digest(css)}; worker-src blob:; "
         "img-src data: blob:; media-src blob:; form-action 'none'; base-uri 'none'"
     )
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
     style = f"<style>{css}</style>"
     embedded_scene = f'<script type="application/json" id="spackle-scene">{scene_json}</script>'
-    script = f"<script>{js}</script>"
+    packed_viewer = base64.b64encode(_gzip(viewer.encode())).decode()
+    embedded_viewer = f'<script type="text/plain" id="spackle-viewer">{packed_viewer}</script>'
+    script = f"<script>{unpack}</script>"
     page = page.replace(TITLE_TAG, _title_tags(str(scene.description["name"]), caption, preview))
     if preview is not None:
         icon = _jpeg_address(preview, ICON_SIDE_PX)
@@ -437,7 +444,7 @@ def single_html(scene: PageScene, caption: str = "", preview: Tensor | None = No
         photo = _jpeg_address(preview, PREVIEW_SIDE_PX)
         page = page.replace(PHOTO_TAG, f'{PHOTO_TAG} src="{photo}"')
     page = page.replace(STYLE_TAG, f"{meta}\n{style}")
-    page = page.replace(SCRIPT_TAG, f"{embedded_scene}\n{script}")
+    page = page.replace(SCRIPT_TAG, f"{embedded_scene}\n{embedded_viewer}\n{script}")
     return page.encode()
 
 
