@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,17 @@ SEND_MENU = """
       sent.push([files[0].name, files[0].type, files[0].size]);
       if (sent.length === 1) throw new DOMException("too late", "NotAllowedError");
     };"""
+
+# Writes down what the dialog says while a file is made.
+NOTE_PROGRESS = """() => {
+  Object.assign(window, { shares: [], lines: [] });
+  const dialog = document.getElementById("sharing");
+  const bar = dialog.querySelector("progress");
+  const line = dialog.querySelector(".line");
+  new MutationObserver(() => bar.hasAttribute("value") && shares.push(bar.value))
+    .observe(bar, { attributes: true, attributeFilter: ["value"] });
+  new MutationObserver(() => lines.push(line.textContent)).observe(line, { childList: true });
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +100,13 @@ def test_a_video_has_the_shape_of_where_it_goes_and_lasts_five_seconds(
 def test_a_gif_has_the_shape_and_plays_for_ever(page: Any) -> None:
     choose(page, "Story")
     choose(page, "GIF, small")
+    page.evaluate(NOTE_PROGRESS)
     name, content = saved(page)
+    shares, lines = page.evaluate("[shares, lines]")
+    assert shares, "nobody could see how far it was"
+    assert shares == sorted(shares)
+    assert all(0 <= share <= 1 for share in shares)
+    assert any(re.fullmatch(r"Making the video: \d+ %", line) for line in lines)
     assert name.endswith("-story.gif")
     with Image.open(io.BytesIO(content)) as gif:
         assert gif.format == "GIF"

@@ -1,6 +1,7 @@
 // The bar below the picture, what stands beside it, and the size of the picture.
 import { isGift } from "./gift.js";
 import { recorder, saveFile, savePicture } from "./save.js";
+import { howFar } from "./source.js";
 
 const ROOM = 230; // pixels beside the picture in which the controls may stay unfolded
 // What is called how, in a scene of a photo and in one that another program made.
@@ -36,12 +37,12 @@ export function panel(viewer, say) {
   document.addEventListener("fullscreenchange", () => press("full", Boolean(document.fullscreenElement)));
   element("download").onchange = ({ target }) => {
     const { value } = target;
-    made(value.startsWith(".") ? `scene${value}` : value, `Making the ${value} file…`);
+    made(value.startsWith(".") ? `scene${value}` : value, `Making the ${value} file`);
     target.value = "";
   };
   element("shot").onclick = () => savePicture(viewer).catch((error) => say(`The picture was not saved: ${error.message}`));
   element("record").onclick = async () => {
-    if (viewer.id) return made(`${viewer.kind}.mp4`, "Making the video…");
+    if (viewer.id) return made(`${viewer.kind}.mp4`, "Making the video");
     if (!record) return say("This browser cannot record a video.");
     if (pressed("record")) return viewer.pause();
     press("record", true);
@@ -53,8 +54,8 @@ export function panel(viewer, say) {
 
   /** Save what the server makes of the scene. */
   async function made(name, line) {
-    say(line, true);
-    await saveFile(viewer, name).then(() => say(""), (error) => say(`Not saved: ${error.message}`));
+    say(`${line}…`, true);
+    await saveFile(viewer, name, (news) => say(line + howFar(news), true)).then(() => say(""), (error) => say(`Not saved: ${error.message}`));
   }
 
   viewer.addEventListener("change", update);

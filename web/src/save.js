@@ -9,10 +9,10 @@ export async function savePicture(viewer) {
   download(blob, `${fileName(viewer)}.png`);
 }
 
-/** A file that the server makes of the scene, for as long as that takes. */
-export async function saveFile(viewer, name) {
+/** A file that the server makes of the scene, for as long as that takes; `onNews` as in `fetched`. */
+export async function saveFile(viewer, name, onNews) {
   const kind = name === "removed.ply" ? "-without-patch" : "";
-  download(await fetched(viewer.id, name), fileName(viewer) + kind + /\.[^.]*$/.exec(name)[0]);
+  download(await fetched(viewer.id, name, "", onNews), fileName(viewer) + kind + /\.[^.]*$/.exec(name)[0]);
 }
 
 function sharpest({ canvas, description }) {

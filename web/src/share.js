@@ -1,6 +1,6 @@
 // One dialog for everything that can be sent: a video in the shape of where it goes, a page, a link.
 import { download, fileName } from "./save.js";
-import { fetched, link } from "./source.js";
+import { fetched, howFar, link } from "./source.js";
 
 const FORM = `<form method="dialog">
   <h2>Share</h2>
@@ -37,6 +37,7 @@ export function sharing(viewer, say) {
   const form = dialog.querySelector("form");
   const { what, format, caption } = form.elements;
   const line = dialog.querySelector(".line");
+  const progress = dialog.querySelector("progress");
   const does = (value) => dialog.querySelector(`button[value=${value}]`);
   let last = { key: null, file: null }; // what was made last, so that it is not made twice
   document.body.append(dialog);
@@ -79,10 +80,17 @@ export function sharing(viewer, say) {
   async function made() {
     const key = [viewer.id, what.value, suffix(), caption.value].join("\n");
     if (last.key === key) return last.file;
-    const blob = await fetched(viewer.id, `${what.value}${suffix()}`, suffix() === ".html" ? caption.value.trim() : "");
+    const blob = await fetched(viewer.id, `${what.value}${suffix()}`, suffix() === ".html" ? caption.value.trim() : "", tell);
     const shape = what.value === "scene" ? "" : `-${what.value}`;
     last = { key, file: new File([blob], `${fileName(viewer)}${shape}${suffix()}`, { type: TYPES[suffix()] }) };
     return last.file;
+  }
+
+  /** Show how far the file is that the server makes. */
+  function tell(news) {
+    line.textContent = `Making ${what.value === "scene" ? "the page" : "the video"}${howFar(news)}`;
+    if (news.share === null) progress.removeAttribute("value");
+    else progress.value = news.share;
   }
 
   async function send(file) {
@@ -98,8 +106,8 @@ export function sharing(viewer, say) {
 
   async function work(task) {
     const controls = form.querySelectorAll("button:not([value=close]), input");
-    const progress = dialog.querySelector("progress");
     for (const each of controls) each.disabled = true;
+    progress.removeAttribute("value");
     progress.hidden = false;
     try {
       await task();

@@ -17,6 +17,7 @@ export async function embedded() {
 }
 
 const SCENES = "/api/v1/scenes";
+const ASK_MS = 400; // between two questions how far a file is
 
 /** What the server takes: {upload}. */
 export async function current() {
@@ -62,10 +63,31 @@ export async function load(id, onProgress = () => {}) {
   });
 }
 
-/** A file that the server makes of a scene; it may take a while. A page may have a caption. */
-export async function fetched(id, name, caption = "") {
+/**
+ * A file that the server makes of a scene; it may take a while. A page may have a caption. `onNews` hears meanwhile how far
+ * it is: {place, share}, the files that come before, or null; and what is made of it in 0..1, or null while nobody knows.
+ */
+export async function fetched(id, name, caption = "", onNews = () => {}) {
   const query = caption && `?caption=${encodeURIComponent(caption)}`;
-  return (await answer(await fetch(file(id, name) + query))).blob();
+  let isOver = false;
+  const timer = setInterval(async () => {
+    // A state that does not come is asked for again; whether the file comes, its own answer says.
+    const { making } = await state(id).catch(() => ({ making: [] }));
+    const news = making.find((each) => each.file === name);
+    if (news && !isOver) onNews(news);
+  }, ASK_MS);
+  try {
+    return await (await answer(await fetch(file(id, name) + query))).blob();
+  } finally {
+    isOver = true;
+    clearInterval(timer);
+  }
+}
+
+/** How far a file is that the server makes, in words that follow what it is. */
+export function howFar({ place, share }) {
+  if (place !== null) return ", which waits for its turn";
+  return share === null ? "" : `: ${Math.round(100 * share)} %`;
 }
 
 /** The address of a page that shows one scene, or null where everybody can see the server's own. */
