@@ -1,4 +1,4 @@
-"""Uniform frames: found around pictures, and not found in skies, backgrounds and dark rooms."""
+"""Uniform frames and thin rims: found around pictures, not in skies, backgrounds and dark rooms."""
 
 from __future__ import annotations
 
@@ -89,10 +89,35 @@ FRAMELESS = {
         X < 12, (0.2, 0.3, 0.5), np.where(X > 160, (0.5, 0.2, 0.2), scene())
     ),
     "too wide a bar": np.where(X < 60, 0.0, scene()),
+    "a floor that darkens towards the border": scene() * np.minimum(1, 0.4 + (HEIGHT - Y) / 25),
     "a bar on one side": framed(scene(), (0, 0, 7, 0), (1.0, 1.0, 1.0)),
-    "lines of one pixel": framed(scene(), (1, 1, 1, 1), (0.0, 0.0, 0.0)),
     "a pixel": scene(1, 1),
 }
+
+
+@pytest.mark.parametrize("blurred", [False, True])
+@pytest.mark.parametrize(
+    ("widths", "color"),
+    [
+        ((0, 0, 3, 0), (0.02, 0.03, 0.02)),  # one side of a scan
+        ((1, 1, 1, 1), (0.0, 0.0, 0.0)),
+        ((0, 2, 0, 0), (1.0, 1.0, 1.0)),
+    ],
+)
+def test_thin_rims_are_found_at_single_sides(
+    widths: Sequence[int], color: Sequence[float], blurred: bool
+) -> None:
+    whole = framed(scene(), widths, color)
+    if blurred:
+        # Each pixel is the mean of itself and its neighbours in the row, and then in the column.
+        for axis in (0, 1):
+            padded = np.pad(whole, [(int(i == axis), int(i == axis)) for i in range(3)], "edge")
+            size = whole.shape[axis]
+            whole = sum(padded.take(range(k, k + size), axis) for k in range(3)) / 3
+    frame = found(whole)
+    assert frame is not None
+    for ours, wanted in zip(frame, widths, strict=True):
+        assert (ours == 0) if wanted == 0 else wanted <= ours <= wanted + blurred
 
 
 @pytest.mark.parametrize("kind", FRAMELESS)

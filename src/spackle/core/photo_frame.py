@@ -1,4 +1,7 @@
-"""Detect the uniform frame around a picture: a scan's margin, letterbox bars or a white mount."""
+"""Detect the uniform frame around a picture: a scan's margin, letterbox bars or a white mount.
+
+A thin dark or bright rim at single sides, as scanners and resizing leave it, belongs to the frame.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,14 @@ MAX_FRAME_NOISE = 9 / 255  # mean difference of a frame's line from the frame's 
 MIN_PICTURE_CONTRAST = 20 / 255  # difference of a pixel that does not belong to the frame
 MIN_STRAIGHT_RATIO = 0.8  # share of an inner edge's pixels that must differ so much
 BLURRED_EDGE_PX = 6  # width of a blurred inner edge
+
+# A rim is at most so wide: 6 pixels, or a share of the photo's width or height.
+MAX_RIM_PX = 6
+MAX_RIM_RATIO = 0.01
+MIN_RIM_CONTRAST = 20 / 255  # of the outermost line to the picture inside
+# What varies inside by more than this share of the rim's contrast is the picture's own.
+MAX_INSIDE_VARIATION = 0.35
+MAX_BLURRED_RIM = 0.1  # share of the contrast at which a rim's blurred edge has ended
 
 Floats = NDArray[np.float32]
 
@@ -53,18 +64,30 @@ class PhotoFrame(NamedTuple):
 
 
 def find_frame(rgb: Tensor) -> PhotoFrame | None:
-    """The uniform frame of an sRGB picture [H, W, 3] in 0..1, or None.
+    """The uniform frame of an sRGB picture [H, W, 3] in 0..1, with thin rims inside it, or None."""
+    height, width = rgb.shape[:2]
+    frame = _find_uniform_frame(rgb) or PhotoFrame(0, 0, 0, 0)
+    rims = [side.rim_width() for side in _sides(frame.inside(rgb, width, height).numpy())]
+    total = PhotoFrame(*(np.array(frame) + np.array(rims)).tolist())
+    return total if any(total) else None
+
+
+def _sides(rows: Floats) -> list[_Side]:
+    """The four sides of a picture [H, W, 3] in the order of PhotoFrame."""
+    # Each side sees the picture as lines of pixels, from its border inwards.
+    columns = rows.swapaxes(0, 1)  # [W, H, 3]
+    return [_Side(lines) for lines in (columns, rows, columns[::-1], rows[::-1])]
+
+
+def _find_uniform_frame(rgb: Tensor) -> PhotoFrame | None:
+    """The uniform frame of an sRGB picture [H, W, 3] in 0..1 without thin rims, or None.
 
     At least two opposite sides must have the same colour and straight inner edges. The rule is
     strict, because a false frame would crop the picture. A frame within the frame, such as a line
     inside a mount, is added to it.
     """
     rows = rgb.numpy()  # [H, W, 3]
-    columns = rows.swapaxes(0, 1)  # [W, H, 3]
-    # The four sides in the order of PhotoFrame: left, top, right and bottom. Each side sees the
-    # picture as lines of pixels, from its border inwards.
-    sides = [_Side(lines) for lines in (columns, rows, columns[::-1], rows[::-1])]
-
+    sides = _sides(rows)
     uniform_widths = [side.uniform_width() for side in sides]
     widths = np.zeros(4, int)
     for index, side in enumerate(sides):
@@ -88,7 +111,7 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
             height, width = rows.shape[:2]
             outer = PhotoFrame(*frame_widths.tolist())
             # Inside of the frame there may be another one; the widths of both add up.
-            inner = find_frame(outer.inside(rgb, width, height))
+            inner = _find_uniform_frame(outer.inside(rgb, width, height))
             if inner is None:
                 return outer
             total_widths = frame_widths + np.array(inner)  # [4]
@@ -148,3 +171,31 @@ class _Side:
         # that has at least 95 % of the largest share.
         end_of_edge = int((differing_ratio >= 0.95 * differing_ratio.max()).argmax())
         return uniform_width + end_of_edge + 1
+
+    def rim_width(self) -> int:
+        """The width of a thin dark or bright rim in pixels, with its blurred edge; 0 without a rim.
+
+        A rim is darker or brighter than the picture inside along most of the side, and the picture
+        inside varies much less.
+        """
+        max_width = max(MAX_RIM_PX, int(MAX_RIM_RATIO * len(self._lines)))
+        # Inside of a rim, as many lines must be calm, and a few more are compared with.
+        reference_start = 2 * max_width
+        brightness = self._lines[: reference_start + MAX_RIM_PX].mean(axis=-1)  # [n, M]
+        if len(brightness) <= reference_start:
+            return 0
+        inside = brightness[reference_start:].mean(axis=0)  # [M]
+        differences = brightness[:reference_start] - inside  # [2·max_width, M]
+        contrasts = np.median(differences, axis=1)
+
+        # Most pixels of the outermost line must differ, and to the same side.
+        rim_contrast = contrasts[0]
+        differs = differences[0] * np.sign(rim_contrast) > MIN_RIM_CONTRAST
+        if abs(rim_contrast) < MIN_RIM_CONTRAST or differs.mean() < MIN_STRAIGHT_RATIO:
+            return 0
+
+        ratios = np.abs(contrasts / rim_contrast)
+        has_ended = ratios < MAX_BLURRED_RIM
+        width = int(has_ended.argmax())  # 0 if no line is so much like the inside
+        is_calm = bool((ratios[width:] < MAX_INSIDE_VARIATION).all())
+        return width if 0 < width <= max_width and is_calm else 0
