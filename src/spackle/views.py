@@ -164,7 +164,12 @@ class PathOptions:
             return Framing(depth_range.focus, DEFAULT_OVERSCAN)
         default_disparity = DEFAULT_MAX_DISPARITY if disparity is None else disparity
         return choose_framing(
-            base, camera, depth_range, self.disparity_or(default_disparity), renderer
+            base,
+            camera,
+            depth_range,
+            self.trajectory,
+            self.disparity_or(default_disparity),
+            renderer,
         )
 
     def video_cameras(

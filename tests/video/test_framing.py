@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from helpers.scenes import box_before_wall
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
+from spackle.core.trajectories import DEFAULT_OVERSCAN, DepthRange, leftmost_and_rightmost
 from spackle.render import CpuRenderer
 from spackle.residual.features import hole_mask
 from spackle.video.framing import (
     MAX_BEYOND_RATIO,
+    MIN_COVERED_ALPHA,
     OVERSCANS,
     Framing,
     choose_framing,
@@ -32,29 +32,34 @@ def beyond_ratio(
     views = leftmost_and_rightmost(camera, disparity, framing.of(depth_range))
     masks = [
         open_to_border(
-            hole_mask(RENDERER.render(base, view.zoomed(1 + framing.overscan)).alpha).numpy()
+            hole_mask(
+                RENDERER.render(base, view.zoomed(1 + framing.overscan)).alpha, MIN_COVERED_ALPHA
+            ).numpy()
         )
         for view in views
     ]
     return float(np.mean(masks))
 
 
-@pytest.mark.parametrize("disparity", [0.03, 0.1])
-def test_hardly_anything_beyond_the_border_is_shown(disparity: float) -> None:
+def test_hardly_anything_beyond_the_border_is_shown() -> None:
     box = box_before_wall(width=192, height=144, focal=160)
     base = box.base()
-    # As if the target were the box: then the wall behind it moves out of the picture.
     depth_range = DepthRange.of(base)
-    framing = choose_framing(base, box.camera, depth_range, disparity, RENDERER)
-    shown = beyond_ratio(base, box.camera, depth_range, disparity, framing)
-    assert shown <= MAX_BEYOND_RATIO + ROUNDING
+    framing = choose_framing(base, box.camera, depth_range, "swipe", 0.05, RENDERER)
+    usual = Framing(depth_range.focus, DEFAULT_OVERSCAN)
+    usual_ratio = beyond_ratio(base, box.camera, depth_range, 0.05, usual)
+    chosen_ratio = beyond_ratio(base, box.camera, depth_range, 0.05, framing)
+    # As the target is the box, the wall behind it moves out of the picture.
+    assert usual_ratio > 2 * ROUNDING
+    assert chosen_ratio <= MAX_BEYOND_RATIO + ROUNDING
 
-    # Neither the target nor the zoom changes more than it must.
-    usual = Framing(depth_range.focus, OVERSCANS[0])
-    if beyond_ratio(base, box.camera, depth_range, disparity, usual) <= MAX_BEYOND_RATIO:
-        assert framing == usual
-    else:
-        assert framing.focus > depth_range.focus or framing.overscan > OVERSCANS[0]
+
+def test_a_small_movement_is_framed_as_mildly_as_possible() -> None:
+    box = box_before_wall(width=192, height=144, focal=160)
+    base = box.base()
+    depth_range = DepthRange.of(base)
+    framing = choose_framing(base, box.camera, depth_range, "rotate-forward", 0.002, RENDERER)
+    assert framing == Framing(depth_range.focus, OVERSCANS[0])
 
 
 def test_an_overscan_that_is_given_keeps_the_usual_target() -> None:

@@ -22,15 +22,14 @@ from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     DepthRange,
     TrajectoryKind,
-    disparity_to_offset,
-    leftmost_and_rightmost,
+    trajectory_cameras,
 )
 from spackle.render.protocol import Renderer
 from spackle.residual.features import hole_mask
 
-# The share of the widest views, on average, that may lie beyond the photo's border: at a height of
-# 3 to 2, a strip of a third of a percent of the width along one side of each view.
-MAX_BEYOND_RATIO = 0.003
+# The share of the widest views, on average, that may lie beyond the photo's border: at most a pixel
+# or two along one side.
+MAX_BEYOND_RATIO = 0.001
 # Zooms that are tried; more would cut off too much of the photo.
 OVERSCANS = (0.03, 0.04, 0.05, 0.06, 0.07, 0.08)
 # The camera's target moves across the view by a share of its width. This share costs half as much
@@ -41,6 +40,8 @@ SIDEWAYS: tuple[TrajectoryKind, ...] = ("swipe", "rotate-forward", "orbit")
 FOCUS_TRIALS = 9  # depths of the target that are tried
 FAR_QUANTILE = 0.9  # of depth: the farthest target
 COARSE_SIDE_PX = 240  # long side of the renderings in which the border is found
+# A coarse pixel that the photo's border cuts in two is half covered.
+MIN_COVERED_ALPHA = 0.5
 MARGIN_RATIO = 0.15  # by which these are wider and higher than the views, on each side
 
 
@@ -60,6 +61,7 @@ def choose_framing(
     base: Gaussians,
     camera: Camera,
     depth_range: DepthRange,
+    trajectory: TrajectoryKind,
     disparity: float,
     renderer: Renderer,
 ) -> Framing:
@@ -72,39 +74,44 @@ def choose_framing(
         base: the Gaussians of the photo.
         camera: the photo's camera at the world's origin.
         depth_range: the scene's depths, with the usual target.
+        trajectory: the path, one of SIDEWAYS.
         disparity: how far the path goes to the side.
         renderer: renders the two widest views.
     """
     coarse = camera.resized(*working_size(camera.width, camera.height, COARSE_SIDE_PX))
-    offset = disparity_to_offset(coarse, disparity, depth_range)
+    # A loop of four frames has the leftmost and the rightmost one.
+    loop = trajectory_cameras(trajectory, coarse, disparity, depth_range, frames=4, looped=True)
+    loop.sort(key=lambda view: float(view.position[0]))
+    widest = (loop[0], loop[-1])
     margin = math.ceil(MARGIN_RATIO * max(coarse.width, coarse.height))
     wide_size = (coarse.width + 2 * margin, coarse.height + 2 * margin)
-    beyond_border = [
-        open_to_border(
-            hole_mask(
-                renderer.render(base, view.cropped(-margin, -margin, *wide_size)).alpha
-            ).numpy(force=True)
-        )
-        for view in leftmost_and_rightmost(coarse, disparity, depth_range)
-    ]
+    beyond_border = []
+    for view in widest:
+        alpha = renderer.render(base, view.cropped(-margin, -margin, *wide_size)).alpha
+        is_hole = hole_mask(alpha, MIN_COVERED_ALPHA).numpy(force=True)
+        beyond_border.append(open_to_border(is_hole))
+
+    principal_x, principal_y = coarse.K[:2, 2].tolist()
 
     def beyond_ratio(shift: float, overscan: float) -> float:
         """Share of the two views beyond the border, if the left one is shifted to the left."""
-        half_width = coarse.width / (1 + overscan) / 2
-        half_height = coarse.height / (1 + overscan) / 2
+        cut_off = 1 - 1 / (1 + overscan)  # share of the width and of the height
         ratios = []
         for mask, direction in zip(beyond_border, (-1, 1), strict=True):
-            middle_x = wide_size[0] / 2 + direction * shift
-            middle_y = wide_size[1] / 2
-            rows = slice(round(middle_y - half_height), round(middle_y + half_height))
-            columns = slice(round(middle_x - half_width), round(middle_x + half_width))
+            # A zoom leaves the principal point in its place.
+            left = margin + principal_x * cut_off + direction * shift
+            top = margin + principal_y * cut_off
+            columns = slice(round(left), round(left + (1 - cut_off) * coarse.width))
+            rows = slice(round(top), round(top + (1 - cut_off) * coarse.height))
             ratios.append(float(mask[rows, columns].mean()))
         return sum(ratios) / len(ratios)
 
     # Cameras that look at a farther target turn less, which shifts what they show.
+    right, _, forward = widest[1].position.tolist()
     best: tuple[bool, float, Framing] | None = None
     for focus, overscan in itertools.product(_targets(base, depth_range), OVERSCANS):
-        shift = coarse.focal[0] * offset * (1 / depth_range.focus - 1 / focus)
+        turn_less = right / (depth_range.focus - forward) - right / (focus - forward)
+        shift = coarse.focal[0] * turn_less
         if shift > margin - 1:
             continue
         ratio = beyond_ratio(shift, overscan)
