@@ -6,9 +6,11 @@ Eq. 8 is `Gaussians.cat([base, aux])`, and eq. 9 the rendering of these Gaussian
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -23,6 +25,8 @@ from spackle.residual.initializer import InitialGaussians, initialize, sample_ph
 from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.runtime.device import Precision
 from spackle.runtime.parallel_kernels import device_for_kernels
+
+T = TypeVar("T")
 
 MIN_AUX_GAUSSIANS = 64  # least number of aux Gaussians in a view (paper, "Training Details")
 # Which cells of a view (2×2 pixels) get an aux Gaussian: "masked" are those in holes, the paper's
@@ -221,6 +225,32 @@ class ViewCompletion:
         if cells.dtype == torch.bool:
             index = cells.flatten().nonzero()[:, 0]
         return compose(chosen, deltas.flatten(0, 1)[index], self.camera)
+
+
+def moved(value: T, device: torch.device) -> T:
+    """A view's completion, or anything that holds tensors, on another device with all that was
+    computed so far.
+
+    Cameras stay on the CPU. A value that is there already is returned as it is.
+
+    Args:
+        value: a tensor, a completion, a dataclass or dictionary with any of these; anything else is
+            returned as it is.
+        device: where the tensors go.
+    """
+    if isinstance(value, Tensor):
+        return cast("T", value.to(device, non_blocking=device.type != "cpu"))
+    if isinstance(value, dict):
+        return type(value)({key: moved(item, device) for key, item in value.items()})
+    has_fields = dataclasses.is_dataclass(value) or isinstance(value, ViewCompletion)
+    if not has_fields or isinstance(value, (type, Camera)):
+        return value
+    fields = {name: moved(field, device) for name, field in vars(value).items()}
+    if all(fields[name] is field for name, field in vars(value).items()):
+        return value
+    other = copy.copy(value)
+    vars(other).update(fields)
+    return other
 
 
 def view_type_of(

@@ -41,6 +41,7 @@ from spackle.runtime.device import pick_dtype
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import make_folder
+from spackle.runtime.parallel_kernels import device_for_kernels
 from spackle.runtime.progress import Reporter
 from spackle.weights.checkpoints import load_strict, read_tensors
 
@@ -203,15 +204,8 @@ def complete_samples(
     """
     device = renderer.device
 
-    # The cells that get a new Gaussian, and the renderer's tiles that these Gaussians can touch.
-    # They are read before the samples move to the renderer's device, because reading them there
-    # would wait for a GPU.
-    cells = []
-    tiles: list[Tensor | None] = []
-    for sample in samples:
-        index = sample.view.chosen_cells(cell_choice).flatten().nonzero()[:, 0]
-        cells.append(index.to(device, non_blocking=True))
-        tiles.append(sample.tiles if cell_choice == "masked" else None)  # None: all tiles
+    samples = [sample.to(device) for sample in samples]
+    tiles = [sample.tiles if cell_choice == "masked" else None for sample in samples]  # None: all
 
     # One pass of the network for all samples.
     features = torch.cat([sample.network_input(inputs) for sample in samples])
@@ -221,9 +215,9 @@ def complete_samples(
     deltas = deltas.float().to(device)  # [B, 14, h, w]: 14 parameters of each cell's Gaussian
 
     # The scene of a sample is its base and the Gaussians that fill its hole.
-    samples = [sample.to(device) for sample in samples]
     scenes = []
-    for sample, sample_deltas, index in zip(samples, deltas, cells, strict=True):
+    for sample, sample_deltas in zip(samples, deltas, strict=True):
+        index = sample.chosen_cells(cell_choice)
         aux = sample.view.gaussians(index, sample_deltas.permute(1, 2, 0))
         scenes.append([sample.base, aux])
 
@@ -439,12 +433,15 @@ class ResidualTask(ViewTask):
     def load_batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
         """Read samples, for validation if `step` is None; InputError if one cannot be read."""
         source = self.validation if step is None else self.training
-        samples = [source.load(item) for item in items]
+        device = device_for_kernels(self.renderer.device)
+        samples = [source.load(item).to(device) for item in items]
 
-        # Each sample computes its network input and its tiles once, and keeps them. This is done
-        # here, in the thread that reads ahead, so that the training loop does not wait for it.
+        # Each sample computes its network input, its cells and its tiles once, and keeps them. This
+        # is done here, in the thread that reads ahead, so that the training loop does not wait for
+        # it; and on the renderer's device, to which a sample travels as images of few channels.
         for sample in samples:
             sample.network_input(self.network.inputs)
+            sample.chosen_cells(self.recipe.cells)
             _ = sample.tiles
         return samples
 

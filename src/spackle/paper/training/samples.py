@@ -4,7 +4,6 @@ in files.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import os
@@ -23,6 +22,7 @@ from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.render.protocol import TILE_PX, Rendering
+from spackle.residual.completion import CellChoice, moved
 from spackle.residual.features import CELL, ViewFeatures, cell_centers, hole_mask
 from spackle.residual.initializer import InitialGaussians
 from spackle.runtime.errors import as_input_error
@@ -197,6 +197,19 @@ class Sample:
             self._network_inputs[names] = self.view.network_input(names)
         return self._network_inputs[names]
 
+    def chosen_cells(self, choice: CellChoice) -> Tensor:
+        """[n] int64: numbers of the cells that get a new Gaussian, row by row; kept for the next
+        call.
+        """
+        if choice not in self._chosen_cells:
+            self._chosen_cells[choice] = self.view.chosen_cells(choice).flatten().nonzero()[:, 0]
+        return self._chosen_cells[choice]
+
+    @functools.cached_property
+    def _chosen_cells(self) -> dict[CellChoice, Tensor]:
+        """The numbers of cells that were chosen so far, by the way of choosing."""
+        return {}
+
     @property
     def hole(self) -> Tensor:
         """[H, W] bool: the hole, the pixels that the base leaves uncovered."""
@@ -218,15 +231,8 @@ class Sample:
         return max_pool2d(near_filled[None, None].float(), TILE_PX, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
-        """The sample on another device, with what composing and rendering need there.
-
-        The camera and the inputs of networks stay on the CPU.
-        """
-        move = functools.partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
-        view = copy.copy(self.view)
-        view.rendering = _map_tensors(self.rendering, move)
-        view.initial = _map_tensors(self.initial, move)
-        return Sample(_map_tensors(self.base, move), view, move(self.target))
+        """The sample on another device, with all that was computed so far."""
+        return moved(self, device)
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
         """Cut out height × width cells of 2×2 pixels, from the upper left cell (row, column).

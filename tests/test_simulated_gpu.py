@@ -1,4 +1,6 @@
-"""The fill on a GPU, in numba's simulator: the processor's results, without copies to the host."""
+"""Fill and training on a GPU, in numba's simulator: the processor's results, without copies to the
+host.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,10 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.holes import box_view, random_network
+from helpers.holes import CPU, box_view, random_network
 from helpers.scenes import shifted
 from helpers.stand_in_gpu import (
+    GPU,
     HANDFUL,
     StandInNetwork,
     StandInRenderer,
@@ -24,6 +27,8 @@ from helpers.stand_in_gpu import (
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.paper.training.residual import complete_samples
+from spackle.paper.training.samples import Sample
 from spackle.runtime import parallel_kernels
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 
@@ -36,7 +41,7 @@ def test_in_the_simulator() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", __file__],
         env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[1],
         capture_output=True,
         text=True,
     )
@@ -114,3 +119,27 @@ def test_a_gpu_without_kernels_leaves_the_work_to_the_processor(
         assert found.means.device.type == "cuda"
     check_close(found, fill_view(context, camera).aux)
     assert max(gpu.to_host) > HANDFUL
+
+
+@needs_simulator
+def test_a_training_step_completes_samples_as_on_the_processor_without_copies() -> None:
+    context, (camera, _) = views()
+    network = context.network
+    assert network is not None
+    rendering = CPU.render(context.base, camera)
+    photo = CPU.render(context.base, context.photo_camera).rgb
+
+    def sample() -> Sample:
+        """The view on the processor, with an arbitrary target."""
+        return Sample.of(
+            context.base, rendering, camera, context.photo_camera, photo, rendering.rgb
+        )
+
+    expected = complete_samples(network, network.inputs, [sample()], CPU)
+    with stand_in_gpu() as gpu:
+        there = sample().to(GPU)
+        there.network_input(network.inputs)
+        stand_in: Any = StandInNetwork(network)
+        found = complete_samples(stand_in, network.inputs, [there], StandInRenderer())
+    assert torch.allclose(unwrap(found.rgb), expected.rgb, atol=1e-3)
+    assert max(gpu.to_host) <= HANDFUL
