@@ -18,6 +18,7 @@ import io
 import json
 import os
 import random
+import select
 import signal
 import socket
 import subprocess
@@ -213,34 +214,28 @@ class Client:
             return answer.status, json.loads(content) if is_json and content else content
 
 
-class Watcher(threading.Thread):
-    """Measures the memory of the server, and how long /healthz takes, until it is told to stop."""
+def watch(port: int, pid: int) -> None:
+    """Measure the server until the standard input ends, and print the measurements as JSON.
 
-    def __init__(self, client: Client, pid: int) -> None:
-        super().__init__(daemon=True)
-        self.client = client
-        self.pid = pid
-        self.health_ms: list[float] = []
-        # How much later than asked this thread wakes up: what the machine itself adds.
-        self.late_ms: list[float] = []
-        self.megabytes: list[float] = []
-        self.should_stop = threading.Event()
-
-    def run(self) -> None:
-        """Measure."""
-        next_memory = 0.0
+    A process of its own does this: in that of the client, it would wait for other threads.
+    """
+    client = Client(port)
+    measured: dict[str, list[float]] = {"health_ms": [], "late_ms": [], "megabytes": []}
+    next_memory = 0.0
+    asleep = time.perf_counter()
+    while not select.select([sys.stdin], [], [], PROBE_S)[0]:
+        start = time.perf_counter()
+        # How much later than asked this process wakes up: what the machine itself adds.
+        measured["late_ms"].append(1000 * (start - asleep - PROBE_S))
+        status, _ = client.ask("/healthz")
+        assert status == 200
+        measured["health_ms"].append(1000 * (time.perf_counter() - start))
+        if time.monotonic() > next_memory:
+            next_memory = time.monotonic() + MEMORY_PROBE_S
+            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            measured["megabytes"].append(pages * os.sysconf("SC_PAGESIZE") / 1e6)
         asleep = time.perf_counter()
-        while not self.should_stop.wait(PROBE_S):
-            start = time.perf_counter()
-            self.late_ms.append(1000 * (start - asleep - PROBE_S))
-            status, _ = self.client.ask("/healthz")
-            assert status == 200
-            self.health_ms.append(1000 * (time.perf_counter() - start))
-            if time.monotonic() > next_memory:
-                next_memory = time.monotonic() + MEMORY_PROBE_S
-                pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
-                self.megabytes.append(pages * os.sysconf("SC_PAGESIZE") / 1e6)
-            asleep = time.perf_counter()
+    print(json.dumps(measured))
 
 
 def children_of(pid: int) -> list[int]:
@@ -310,8 +305,10 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
     with small_disk() as (disk, has_own_disk), running_server(disk / "scenes") as (server, client):
         # What the first job loads is no leak.
         client.ask(SCENES, "POST", form(photo(0)), "multipart/form-data")
-        watcher = Watcher(client, server.pid)
-        watcher.start()
+        numbers = ["--watch", str(server.pid), "--port", str(client.port)]
+        watcher = subprocess.Popen(
+            [sys.executable, __file__, *numbers], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         start = time.monotonic()
         sent = 0
         filler: threading.Thread | None = None
@@ -354,8 +351,7 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
             filler.join()
         wait_for_room(client, states, 0)
         seconds = time.monotonic() - start
-        watcher.should_stop.set()
-        watcher.join()
+        measured = json.loads(watcher.communicate()[0])
         time.sleep(6)  # what nobody waits for any more is given up by now
         folders = {path.name for path in (disk / "scenes").iterdir() if path.is_dir()}
         ends = {id: (disk / "scenes" / id / "ends").read_text() for id in states}
@@ -365,7 +361,8 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
         server.terminate()
         server.wait(60)
         loop_report = json.loads((disk / LOOP_FILE).read_text())
-    third = max(1, len(watcher.megabytes) // 3)
+    megabytes = measured["megabytes"]
+    third = max(1, len(megabytes) // 3)
     return {
         "jobs sent": sent,
         "minutes": round(seconds / 60, 1),
@@ -383,13 +380,13 @@ def soak(job_count: int, minutes: float) -> dict[str, Any]:
         "disk full once": has_own_disk,
         "processes at the end": workers,
         "seconds of the slowest refusal": round(max(refused_bombs, default=0), 1),
-        "healthz, ms": summary(watcher.health_ms),
-        "a thread of the client wakes up late by, ms": summary(watcher.late_ms),
+        "healthz, ms": summary(measured["health_ms"]),
+        "who asks for it wakes up late by, ms": summary(measured["late_ms"]),
         **loop_report,
         "server, MB": {
-            "first third": round(sum(watcher.megabytes[:third]) / third),
-            "last third": round(sum(watcher.megabytes[-third:]) / third),
-            "most": round(max(watcher.megabytes)),
+            "first third": round(sum(megabytes[:third]) / third),
+            "last third": round(sum(megabytes[-third:]) / third),
+            "most": round(max(megabytes)),
         },
     }
 
@@ -435,11 +432,15 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=300)
     parser.add_argument("--minutes", type=float, default=10)
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--watch", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--port", type=int, help=argparse.SUPPRESS)
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
     if given.serve is not None:
         serve(given.serve, given.port)
+        return
+    if given.watch is not None:
+        watch(given.port, given.watch)
         return
     text = json.dumps(soak(given.jobs, given.minutes), indent=1)
     print(text)
