@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The versions of all packages, for every Python and system: CONTRIBUTING.md says how they are renewed.
 PINNED := --constraint constraints.txt
 PIP := $(BIN)/pip install --disable-pip-version-check --quiet $(PINNED)
-.PHONY: demo test test-fast hooks pins fuzz test-wheel test-slow wheel dist test-install docs lint types check release-check bench reproduce viewer clean clean-cache
+.PHONY: demo test test-fast hooks pins fuzz test-cudasim test-wheel test-slow wheel dist test-install docs lint types check release-check bench reproduce viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	@echo "Installing Spackle and what it needs into $(VENV), once: some minutes, and about 400 MB of downloads."
@@ -74,6 +74,10 @@ fuzz: $(VENV)/.installed
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow tests research/lite/tests research/worlds/tests
+
+# What runs on a GPU, in numba's simulator; `test` runs it, too.
+test-cudasim: $(VENV)/.installed
+	NUMBA_ENABLE_CUDASIM=1 $(BIN)/python -m pytest -n 0 tests/test_simulated_gpu.py
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

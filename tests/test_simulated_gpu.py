@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -23,13 +24,17 @@ from helpers.stand_in_gpu import (
     on_gpu,
     stand_in_gpu,
     unwrap,
+    wrap,
 )
+from torch import is_tensor
+from torch.utils._pytree import tree_leaves, tree_map
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.paper.training.residual import complete_samples
 from spackle.paper.training.samples import Sample
 from spackle.runtime import parallel_kernels
+from spackle.runtime.parallel_kernels import ParallelKernel
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 
 IS_SIMULATED = os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
@@ -73,6 +78,36 @@ def check_close(found: Gaussians, expected: Gaussians) -> None:
     pairs = zip(found.tensors, expected.tensors, strict=True)
     agree = [torch.isclose(unwrap(a), b, rtol=1e-3, atol=1e-3).flatten() for a, b in pairs]
     assert float(torch.cat(agree).float().mean()) >= 0.999
+
+
+@needs_simulator
+def test_each_kernel_writes_the_arrays_that_it_writes_on_the_processor() -> None:
+    context, (camera, _) = views()
+    run_on_processor = ParallelKernel.__call__
+    compared: dict[str, int] = {}
+
+    def run_twice(kernel: ParallelKernel, size: Any, *arguments: Any) -> None:
+        """Run a kernel on the processor, and on the stand-in with copies of its arguments."""
+        # Arguments that share memory, as where a kernel works in place, share it in the copies.
+        memory = {
+            (tensor.data_ptr(), tensor.shape): wrap(tensor.clone())
+            for tensor in tree_leaves(arguments)
+            if is_tensor(tensor)
+        }
+        copies = tree_map(lambda a: memory[a.data_ptr(), a.shape] if is_tensor(a) else a, arguments)
+        run_on_processor(kernel, size, *arguments)
+        with stand_in_gpu():
+            run_on_processor(kernel, size, *copies)
+        for here, there in zip(tree_leaves(arguments), tree_leaves(copies), strict=True):
+            if is_tensor(here):
+                agree = torch.isclose(unwrap(there), here, rtol=1e-4, atol=1e-5, equal_nan=True)
+                differing = int((~agree).sum())
+                assert differing <= 0.001 * agree.numel(), kernel.__name__
+        compared[kernel.__name__] = compared.get(kernel.__name__, 0) + 1
+
+    with mock.patch.object(ParallelKernel, "__call__", run_twice):
+        fill_view(context, camera)
+    assert len(compared) >= 18, compared
 
 
 @needs_simulator
