@@ -22,6 +22,7 @@ from spackle.paper.training.losses import hole_distance, hole_psnr
 from spackle.pipeline import CompletedPhoto, Pipeline, PipelineOptions, complete
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
+from spackle.results.many_photos import say_if_kernels_compile
 from spackle.results.photo_folder import save_planned_video
 from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
@@ -60,6 +61,8 @@ def run_demo(output: Path, reporter: Reporter) -> None:
         )
     )
     renderer = pipeline.renderer
+    # The demo is the first that most people run.
+    say_if_kernels_compile(pipeline, reporter)
     with results_folder(output, RESULT_FILES, locked=True):
         start = time.perf_counter()
         photo = Photo(
