@@ -19,13 +19,9 @@ RUN pip install --constraint constraints.txt --extra-index-url "$TORCH_INDEX" to
     && pip install --constraint constraints.txt '.[train]' \
     && rm -rf build src/*.egg-info
 
-# Compiles the kernels, so that the first photo need not wait for them. The picture shows a thing before
-# a wall, because outlines have kernels of their own; the exports are those that the server makes.
+# Compiles the kernels, as the server does while its page is empty: the first photo need not wait for them.
 RUN mkdir -p /opt/spackle/kernels /opt/spackle/weights /opt/spackle/home /opt/spackle/work/scenes \
-    && python -c "import numpy; from PIL import Image; rows, columns = numpy.indices((96, 128)); Image.fromarray(numpy.where((abs(rows - 60) < 30) & (abs(columns - 64) < 20), 255, rows + columns).astype('uint8')).save('/opt/spackle/first.png')" \
-    && spackle predict /opt/spackle/first.png -o /opt/spackle/first --frames 2 \
-    && spackle export /opt/spackle/first/first/scene.ply -o /opt/spackle/first/a.spz -o /opt/spackle/first/a.sog -o /opt/spackle/first/a.glb -o /opt/spackle/first/a.html \
-    && rm -rf /opt/spackle/first /opt/spackle/first.png \
+    && python -c "from spackle.results.warm_up import compile_kernels; compile_kernels()" \
     && chmod -R a+rwX /opt/spackle/kernels /opt/spackle/weights /opt/spackle/home /opt/spackle/work
 
 # Any user may run it: docker run --user "$(id -u):$(id -g)"

@@ -5,13 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
-from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
@@ -25,6 +22,7 @@ from spackle.formats.scene_files import load_scene, scene_suffix
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import get_renderer
 from spackle.results.photo_folder import REPORT_NAME, PhotoOptions, predict_photo
+from spackle.results.warm_up import compile_kernels
 from spackle.runtime.declared_options import DECLARATIONS
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic, write_json
@@ -76,7 +74,6 @@ PAGE = "page.json"  # what the page draws, without the Gaussians
 PREVIEW = "photo.jpg"  # the small photo that the page shows until the scene is ready
 # What the page says of a scene whose depth a small network has guessed.
 ROUGH_DEPTH_NOTE = "Rough depth: a quick guess."
-WARM_UP_SIDE_PX = 64  # pixels of the picture with which a process prepares
 
 
 def declared_field(name: str, **changes: Any) -> Any:
@@ -282,22 +279,7 @@ class SceneWork:
 
     def _warm_up(self) -> None:
         """Compile the kernels, and load the base: the first photo then need not wait for them."""
-        reporter = Reporter(False, Console(quiet=True, force_terminal=False))
-        quick = dataclasses.replace(self.base, name=LiteBase.name, checkpoint=None)
-        options = PipelineOptions(base=quick, path=PathOptions(), fill=FillOptions())
-        with tempfile.TemporaryDirectory(prefix="spackle-warm-up-") as folder:
-            # Dark to the left, bright to the right, with a square that stands out: there are edges,
-            # and holes behind them.
-            side = WARM_UP_SIDE_PX
-            picture = np.tile(np.linspace(40, 200, side), (side, 1))
-            picture[side // 3 : -side // 3, side // 3 : -side // 3] = 255
-            photo = Path(folder) / "photo.png"
-            Image.fromarray(picture.astype(np.uint8)).convert("RGB").save(photo)
-            photo_options = PhotoOptions(lens={}, render=False)
-            predict_photo(
-                photo, Path(folder) / "results", Pipeline.open(options), reporter, photo_options
-            )
-            Scene.load(Path(folder) / "results" / SCENE_FILE).page("photo")
+        compile_kernels(self.base.device)
         self._opened(PipelineOptions(base=self.base, path=PathOptions(), fill=FillOptions()))
 
     def _base_settings(self, job: Job, options: SceneOptions) -> BaseSettings:
