@@ -11,6 +11,7 @@ import posed_scenes
 import pytest
 import suite
 import torch
+from many_photos import ProcessFacts, Sample, family_of, table_row
 from naive_renderer import naive_render
 from suite_scenes import holed_scene, photo_scene
 
@@ -33,6 +34,22 @@ def test_the_suite_measures_the_renderer_and_a_completion(tmp_path: Path) -> Non
         assert section["figures"]
         assert "not run" not in section["facts"]
     assert "naive over ours" in (tmp_path / "suite.md").read_text()
+
+
+def test_the_costs_of_a_run_are_those_of_all_its_processes_behind_the_first_photos() -> None:
+    def started_by(parent: int) -> ProcessFacts:
+        return ProcessFacts(parent=parent, start="0", seconds=1.0, memory_mb=1.0)
+
+    # 5 is the command, 7 and 8 its workers' processes, 9 a stranger's.
+    facts = {5: started_by(1), 8: started_by(7), 7: started_by(5), 9: started_by(1)}
+    assert family_of(5, facts) == {5, 7, 8}
+
+    samples = [
+        Sample(50, 4.0, 2.0, 90.0),
+        Sample(100, 9.0, 3.0, 100.0),
+        Sample(200, 11.0, 3.5, 101.0),
+    ]
+    assert table_row("two", samples) == "| two | 200 | 20.0 | 5.0 | 100 | 101 |"
 
 
 def test_a_rendered_scene_becomes_photos_with_cameras_of_which_some_are_chosen(
