@@ -307,8 +307,9 @@ def _dequantised(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 # --- The base
 
 SHIPPED_WEIGHTS = Path(__file__).parents[1] / "weights" / "lite.safetensors"
-# At a larger move of the camera upright objects lean and poles bend: docs/lab/lite.md.
-MAX_DISPARITY = 0.15
+# At a larger move of the camera upright objects lean, outlines fray and poles bend:
+# docs/lab/lite.md.
+MAX_DISPARITY = 0.1
 # Share of the widest views that may be holes: more invented parts would be conspicuous.
 MAX_HOLE_RATIO = 0.075
 MAX_DEPTH_RATIO = 60.0  # depths are limited to this multiple of the nearest depth
