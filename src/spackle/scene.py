@@ -465,7 +465,9 @@ class Scene:
         framing = path.choose_framing(
             self.base, self.camera, self.depth_range, self.disparity, used_renderer
         )
-        cameras = path.video_cameras(self.depth_range, self.camera, None, self.disparity, framing)
+        cameras = path.video_cameras(
+            self.depth_range, self.camera, keyframes=None, disparity=self.disparity, framing=framing
+        )
         frame_maker = FrameMaker.of(
             video, self.base, cameras, name_in_messages, is_metric=self.is_metric
         )

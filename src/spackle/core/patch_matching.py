@@ -310,7 +310,10 @@ class _LevelSearch:
         )
 
     def score(self) -> None:
-        """Compute the cost of each hole pixel's patch anew, because a vote changed the colours."""
+        """Compute anew how badly each hole pixel's patch matches (its cost).
+
+        `vote` has changed the colours of the hole, with which patches are compared.
+        """
         score_match(
             len(self._hole_pixels),
             self._hole_pixels,
@@ -354,7 +357,7 @@ class _LevelSearch:
         vote_color(
             len(self._hole_pixels),
             self._hole_pixels,
-            self.matches.numbers,
+            self.matches.numbers,  # of the hole's pixels
             self.matches.positions,
             self.matches.costs,
             np.float32(max(mean_cost, MIN_MEAN_COST)),

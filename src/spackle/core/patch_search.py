@@ -142,10 +142,10 @@ def score_match(n: int, hole_pixels: Any, matches: Any, inputs: Any, costs: Any)
 
     Args:
         n: number of the hole pixel.
-        hole_pixels: [n, 2] rows and columns.
-        matches: [n, 3] source, row and column of each pixel's patch.
+        hole_pixels: [holes, 2] rows and columns.
+        matches: [holes, 3] source, row and column of each pixel's patch.
         inputs: the images, `CostInputs`.
-        costs: [n] written.
+        costs: [holes] written.
     """
     y, x = hole_pixels[n]
     source, v, u = matches[n]
@@ -164,13 +164,13 @@ def start_match(
     column of the patch's centre in the source.
 
     Args:
-        hole_pixels: [n, 2] rows and columns.
+        hole_pixels: [holes, 2] rows and columns.
         has_coarse: whether there is a coarser level; else all matches are random.
         coarse_numbers: [⌈h/2⌉, ⌈w/2⌉] numbers of the coarser level's hole pixels; −1 elsewhere.
         coarse_matches: [m, 3] the coarser level's matches, by these numbers.
         is_usable: [2, h, w] whether the patch around a pixel of each source has no hole pixel.
         usable_centers: [k, 2] rows and columns of the picture's patches without hole pixels.
-        matches: [n, 3] written.
+        matches: [holes, 3] written.
     """
     coarse_height, coarse_width = coarse_numbers.shape
     height, width = is_usable.shape[1:]
@@ -209,17 +209,17 @@ def improve_match(
 
     Args:
         n: number of the hole pixel.
-        hole_pixels: [n, 2] rows and columns.
+        hole_pixels: [holes, 2] rows and columns.
         numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
-        old_matches: [n, 3] source, row and column of each pixel's patch.
-        old_costs: [n] of these matches.
+        old_matches: [holes, 3] source, row and column of each pixel's patch.
+        old_costs: [holes] of these matches.
         is_usable: [2, h, w] whether the patch around a pixel of each source has no hole pixel.
         usable_centers: [k, 2] rows and columns of the picture's patches without hole pixels.
         step: distance in pixels to the neighbours.
         seed: uint32 that makes the random numbers of this call differ from those of others.
         inputs: the images, `CostInputs`.
-        matches: [n, 3] written.
-        costs: [n] written.
+        matches: [holes, 3] written.
+        costs: [holes] written.
     """
     source_count, height, width = is_usable.shape
     y, x = hole_pixels[n]
@@ -282,10 +282,10 @@ def vote_color(
 
     Args:
         n: number of the hole pixel.
-        hole_pixels: [n, 2] rows and columns.
+        hole_pixels: [holes, 2] rows and columns.
         numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
-        matches: [n, 3] source, row and column of the centre of each pixel's patch.
-        costs: [n] of these matches.
+        matches: [holes, 3] source, row and column of the centre of each pixel's patch.
+        costs: [holes] of these matches.
         mean_cost: float32, above 0.
         source_rgb: [2, h, w, 3] the picture and its mirror image.
         rgb: [h, w, 3] written at the hole pixels.

@@ -77,7 +77,7 @@ class ViewCompletion:
             camera: of the view.
             photo_camera: of the photo from which the base was predicted.
             get_photo: returns the photo I of eq. 5, [H', W', 3] sRGB, of the size of its camera;
-                called only for a network that names "photo".
+                called only for a network with "photo" among its inputs.
             threshold: τ_α of eq. 4: a pixel with a lower opacity is a hole.
         """
         self.rendering = rendering.to(device_for_kernels(rendering.alpha.device))

@@ -267,7 +267,11 @@ def _open_scene_video(
                 scene.base, scene.camera, scene.depth_range, scene.disparity, renderer
             )
             cameras = path.video_cameras(
-                scene.depth_range, scene.camera, None, scene.disparity, framing
+                scene.depth_range,
+                scene.camera,
+                keyframes=None,
+                disparity=scene.disparity,
+                framing=framing,
             )
         elif cameras is None:
             cameras = path.video_cameras(

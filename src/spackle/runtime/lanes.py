@@ -169,7 +169,9 @@ class Lane:
                 self.cancel(order)
 
     def close(self) -> None:
-        """End all orders and processes, and wait until the lane's threads have ended."""
+        """End all orders (pieces of work) and processes, and wait until the lane's threads have
+        ended.
+        """
         with self.lock:
             self.is_closed = True
             orders = [*self._waiting, *self._running]
@@ -178,7 +180,8 @@ class Lane:
             self.cancel(order)
         for process in idle:
             process.kill()
-        # The first process of all takes seconds to start, which nobody wants to wait for any more.
+        # The first process of all takes seconds to start: the server process from which Python
+        # forks it imports torch first. Without that server the start fails at once.
         while self._starting_count:
             end_server_that_imports()
             time.sleep(CLOSE_POLL_S)
@@ -211,9 +214,10 @@ class Lane:
                 process = self._idle.pop()
                 if process.alive:
                     return process
-                self._forget(process)
+                self._forget(process)  # its GPU is free for another one
             if self.is_closed:
                 return None
+            # Without a number, a process computes on the GPU that torch takes by default, if any.
             gpu_number = self._free_gpu_numbers.pop(0) if self._free_gpu_numbers else None
             self._starting_count += 1
 
@@ -237,8 +241,8 @@ class Lane:
         except (OSError, EOFError):
             if self.is_closed:
                 return None
-            # Somebody has ended the server that forks processes, another lane that was closed or a
-            # system without memory. Another server is started now.
+            # Python forks processes from a server process. This one is gone: another lane has
+            # closed and ended it, or the system lacked memory. A second attempt starts a new one.
             return TaskProcess(self._work, gpu_number)
 
     def give_back(self, process: TaskProcess) -> None:

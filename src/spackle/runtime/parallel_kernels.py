@@ -49,7 +49,8 @@ class ParallelKernel:
 
         Args:
             body: what is computed for one item or pixel. Its first arguments are the item's number,
-                or the pixel's row and column. It may write its own elements of arrays alone.
+                or the pixel's row and column. Of the arrays, it may write only the elements of this
+                item or pixel, because many run at the same time.
             loop: the text of the loop around it.
             index_count: 1 for items, 2 for pixels.
         """
@@ -65,8 +66,8 @@ class ParallelKernel:
 
         # The loop stands in the body's module and file, by which numba knows where its machine code
         # belongs on disk, and whether it is still the right one.
-        # Without numba's runtime ("nrt") the arrays of each item are not counted as references,
-        # which would take longer than most bodies; so a body can make no arrays of its own.
+        # Numba's runtime ("nrt") would count at each call of the body who uses the arrays, which
+        # takes longer than most bodies. Without it, a body can make no arrays of its own.
         inlined_body = compile_kernel(body, FASTMATH, forceinline=True, _nrt=False)
         module: dict[str, Any] = {"__name__": body.__module__, body.__name__: inlined_body}
         exec(compile(text, inspect.getfile(body), "exec"), module)

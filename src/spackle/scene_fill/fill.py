@@ -84,7 +84,13 @@ def fill_view(
     renderer = IncrementalRenderer(context.renderer, context.base)
     view_rendering = renderer.render(camera, rendering)
     filled = _fill_in_passes(
-        context, renderer, view_rendering, camera, guards, max_hole_ratio=0, with_underlays=False
+        context,
+        renderer,
+        view_rendering,
+        camera,
+        guards,
+        max_hole_ratio=0,  # another pass, if any pixel is still a hole
+        with_underlays=False,  # these only show in other views
     )
     aux = Gaussians.cat([Gaussians.empty(device), *(part.to(device) for part in filled.aux)])
     return FilledView(aux, filled.rendering.to(device))

@@ -208,6 +208,7 @@ def pixel_gaussians(
         unit=initial.unit,
     )
     pixel_deltas = None if deltas is None else repeat(deltas)
+    # Guesses and changes together make Gaussians of half a pixel.
     composed = compose(pixels, pixel_deltas, camera, spread_px=PIXEL_SIGMA_PX)
 
     # The pixels' own colours replace those that the network predicts for the cell.

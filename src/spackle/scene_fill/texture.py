@@ -198,7 +198,9 @@ def continue_border(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     the object.
 
     Args:
-        view: a view with holes, in cells of 2×2 pixels.
+        view: a view with holes, in cells of 2×2 pixels. Its `initial` has the first guess of each
+            hole cell's depth, its `features` what is visible; `beyond_photo` [h, w] bool are the
+            hole cells that the photo does not show.
         structure: [h, w, 3] sRGB, the smooth colours of all cells.
     """
     features = view.features

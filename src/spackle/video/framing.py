@@ -94,7 +94,16 @@ def choose_framing(
     principal_x, principal_y = coarse.K[:2, 2].tolist()
 
     def beyond_ratio(shift: float, overscan: float) -> float:
-        """Share of the two views beyond the border, if the left one is shifted to the left."""
+        """Share of the two views that lies beyond the border.
+
+        The masks `beyond_border` are those of coarse views with a margin, in which a frame is cut
+        out.
+
+        Args:
+            shift: coarse pixels by which the left view's frame moves to the left, and the right
+                one's to the right.
+            overscan: zoom, as a relative gain in focal length.
+        """
         cut_off = 1 - 1 / (1 + overscan)  # share of the width and of the height
         ratios = []
         for mask, direction in zip(beyond_border, (-1, 1), strict=True):

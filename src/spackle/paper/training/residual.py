@@ -436,9 +436,10 @@ class ResidualTask(ViewTask):
         device = device_for_kernels(self.renderer.device)
         samples = [source.load(item).to(device) for item in items]
 
-        # Each sample computes its network input, its cells and its tiles once, and keeps them. This
-        # is done here, in the thread that reads ahead, so that the training loop does not wait for
-        # it; and on the renderer's device, to which a sample travels as images of few channels.
+        # Each sample computes the network's input, the cells of 2×2 pixels that get Gaussians, and
+        # the renderer's tiles to draw once, and keeps them. This is done here, in the thread that
+        # reads ahead, so that the training loop does not wait for it. It is done on the renderer's
+        # device, because the sample's images are fewer bytes to copy there than the input is.
         for sample in samples:
             sample.network_input(self.network.inputs)
             sample.chosen_cells(self.recipe.cells)
