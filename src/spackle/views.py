@@ -39,7 +39,7 @@ from spackle.residual.features import hole_area_ratio
 from spackle.runtime.declared_options import MAX_FRAME_COUNT as MAX_FRAME_COUNT
 from spackle.runtime.errors import InputError, as_input_error, check_name
 from spackle.video.frames import SAME_ASPECT_TOLERANCE, FrameMaker
-from spackle.video.framing import SIDEWAYS, Framing, choose_framing
+from spackle.video.framing import COARSE_SIDE_PX, SIDEWAYS, Framing, choose_framing
 from spackle.video.options import VideoOptions
 
 DEFAULT_FRAME_COUNT = 60  # cameras of `Scene.path`; of a longer path, 60 to 119 frames are filled
@@ -48,7 +48,6 @@ MAX_OVERSCAN = 0.5  # focal length times 1.5, which leaves 44 % of the photo's a
 MAX_REPORTED_KEYFRAMES = 16  # the report measures the holes of at most so many keyframes
 
 NEARLY_NO_PX = 0.01  # by so little, views that show the same may seem to differ
-COARSE_SIDE_PX = 240  # long side of the renderings in which `choose_disparity` measures holes
 DISPARITY_STEP = 0.01  # `choose_disparity` rounds the disparity down to a multiple of this step
 MIN_CHOSEN_DISPARITY = 0.04  # a smaller movement shows no parallax
 MAX_TRIALS = 3  # disparities that `choose_disparity` tries besides the base's usual one

@@ -241,7 +241,9 @@ def moved(value: T, device: torch.device) -> T:
     if isinstance(value, Tensor):
         return cast("T", value.to(device, non_blocking=device.type != "cpu"))
     if isinstance(value, dict):
-        return type(value)({key: moved(item, device) for key, item in value.items()})
+        items = {key: moved(item, device) for key, item in value.items()}
+        is_there = all(items[key] is item for key, item in value.items())
+        return value if is_there else type(value)(items)
     has_fields = dataclasses.is_dataclass(value) or isinstance(value, ViewCompletion)
     if not has_fields or isinstance(value, (type, Camera)):
         return value

@@ -76,7 +76,8 @@ class ViewFeatures:
         # Light is what is averaged, so each colour is decoded once before, and encoded after. Along
         # whole rows [H, 3W] these conversions run in vector registers.
         light = torch.empty_like(rgb)
-        _decode(_rows_and_numbers(rgb), rgb.flatten(1), light.flatten(1))
+        rows_of_colors = rgb.flatten(1)
+        _decode(rows_of_colors.shape, rows_of_colors, light.flatten(1))
 
         height, width = alpha.shape
         rows = math.ceil(height / CELL)
@@ -92,13 +93,8 @@ class ViewFeatures:
             features.rgb, features.inverse_depth, features.alpha, features.mask,
         )  # fmt: skip
         cell_colors = features.rgb.flatten(1)
-        _encode(_rows_and_numbers(features.rgb), cell_colors, cell_colors)
+        _encode(cell_colors.shape, cell_colors, cell_colors)
         return features
-
-
-def _rows_and_numbers(image: Tensor) -> tuple[int, int]:
-    """The number of rows of an image [H, W, C], and the number W·C of values in a row."""
-    return image.shape[0], image[0].numel()
 
 
 def cell_centers(camera: Camera) -> Tensor:

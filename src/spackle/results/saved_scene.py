@@ -262,20 +262,14 @@ def _open_scene_video(
         as_input_error(path.path, "{reason}", PathError),
     ):
         cameras = given.views
-        if cameras is None and given.keyframes is None:
-            framing = path.choose_framing(
-                scene.base, scene.camera, scene.depth_range, scene.disparity, renderer
-            )
+        if cameras is None:
+            framing = None  # keyframes say themselves what is in the frame
+            if given.keyframes is None:
+                framing = path.choose_framing(
+                    scene.base, scene.camera, scene.depth_range, scene.disparity, renderer
+                )
             cameras = path.video_cameras(
-                scene.depth_range,
-                scene.camera,
-                keyframes=None,
-                disparity=scene.disparity,
-                framing=framing,
-            )
-        elif cameras is None:
-            cameras = path.video_cameras(
-                scene.depth_range, scene.camera, given.keyframes, scene.disparity, framing=None
+                scene.depth_range, scene.camera, given.keyframes, scene.disparity, framing
             )
 
     _say_if_beyond_completion(scene, scene_file, path, reporter)

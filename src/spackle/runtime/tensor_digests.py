@@ -12,7 +12,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from spackle.runtime.digests import DIGEST_KEY, signed, unsigned
+from spackle.runtime.digests import DIGEST_KEY, unsigned
 
 NO_TEXTS: Mapping[str, str] = {}
 
@@ -24,7 +24,7 @@ def signed_tensors(tensors: Mapping[str, Tensor], texts: Mapping[str, str] = NO_
         tensors: by name.
         texts: further values by name, which are no tensors' names.
     """
-    digest = signed({**tensors, **texts}, tree_digest)[DIGEST_KEY]
+    digest = tree_digest({**tensors, **texts})
     return save(dict(tensors), metadata={**texts, DIGEST_KEY: digest})
 
 

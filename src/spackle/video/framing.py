@@ -39,7 +39,8 @@ TARGET_SHIFT_COST = 0.5
 SIDEWAYS: tuple[TrajectoryKind, ...] = ("swipe", "rotate-forward", "orbit")
 FOCUS_TRIALS = 9  # depths of the target that are tried
 FAR_QUANTILE = 0.9  # of depth: the farthest target
-COARSE_SIDE_PX = 240  # long side of the renderings in which the border is found
+# Long side of the renderings in which the border is found, and holes are measured (views.py).
+COARSE_SIDE_PX = 240
 # A coarse pixel that the photo's border cuts in two is half covered.
 MIN_COVERED_ALPHA = 0.5
 MARGIN_RATIO = 0.15  # by which these are wider and higher than the views, on each side
