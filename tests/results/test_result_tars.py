@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tarfile
-import time
 import types
 from pathlib import Path
 from typing import Any
@@ -162,22 +161,29 @@ def test_a_run_that_ends_around_a_tar_goes_on_with_the_same_bytes(
 
 @needs_posix_signals
 @pytest.mark.slow
-def test_a_killed_run_of_workers_ends_with_the_same_tars(place: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("who", "code", "says"),
+    [("worker", 2, "a worker process died"), ("command", -signal.SIGKILL, "")],
+)
+def test_a_kill_among_workers_ends_with_the_same_tars(
+    place: Path, tmp_path: Path, who: str, code: int, says: str
+) -> None:
+    """A worker, or the command, is killed in the middle of a photo, with others at work."""
     out = tmp_path / "out"
+    # The base obeys this file at the last photo, when other photos are done.
+    (place / "photos" / "b.kill").write_text(who)
     command = [sys.executable, "-m", "spackle", *map(str, words(place, out)), "--workers", "2"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen(
-        command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True
-    ) as process:
-        while not list(out.glob("results-*.tar")) and process.poll() is None:
-            time.sleep(0.01)
-        process.kill()
-    # Its workers end by themselves, a moment later.
-    with contextlib.suppress(ProcessLookupError):
-        while True:
-            os.killpg(process.pid, 0)
-            time.sleep(0.01)
+    killed = subprocess.run(
+        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert killed.returncode == code
+    assert says in killed.stderr
+
+    # The bytes are the same whether several processes go on, or one.
     written = {tar: tar.stat().st_mtime_ns for tar in out.glob("results-*.tar")}
-    assert predict(place, out).code == 1
+    assert TARS[2] not in {tar.name for tar in written}
+    assert predict(place, out, "--workers", 2).code == 1
     assert_same(out, place / "whole")
+    # What was done before is not done again.
     assert all(tar.stat().st_mtime_ns == time_ns for tar, time_ns in written.items())
