@@ -2,12 +2,15 @@
 Markdown table.
 
     python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 \
-        [--last 0.2] [--weights FILE] [--pictures PNG] [--standing PHOTOS]
+        [--rooms FOLDER] [--last 0.2] [--weights FILE] [--outlines] [--pictures PNG] \
+        [--standing PHOTOS]
 
 Each --stereo is a folder of scenes, which have a scene.json, or a calib.txt as in ETH3D and
 Middlebury 2014. Each --rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in
 metres; --last uses only the last share of its frames, those that `lite.yaml` does not train on.
-Each guess is aligned by the best scale and shift (`depth_loss.py`). --standing makes 40 synthetic
+Each --rooms is a folder of furnished rooms of `research/worlds`, of which the photos are used.
+Each guess is aligned by the best scale and shift (`depth_loss.py`). --outlines adds a table of
+lite's depth edges within 2 pixels of the true ones (`outlines.py`). --standing makes 40 synthetic
 streets with standing objects, with textures cut from PHOTOS, and measures the error within objects
 (`standing.py`). The last line is the time for a photo of 640×480, median of 9 runs.
 """
@@ -18,12 +21,15 @@ import argparse
 import statistics
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from depth_loss import DepthScore, score_depth, vertical_ramp
 from frames import JUDGED_SIDE, Frame, Measured, of_camera, of_scenes, reduced
+from made_rooms import of_rooms
+from outlines import TRUE_RATIO, OutlineCounts, compare_outlines
 from standing import StandingScore, labelled_scene, score_standing
 from synthetic_scenes import PhotoDraw
 from task import colored, ends
@@ -65,6 +71,13 @@ def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]
             RgbdFolder(folder=folder, focal_px=1.0, unit_m=unit), arguments.last
         )[1]
         yield folder.name, [file.read(JUDGED_SIDE) for file in files]
+    for folder in arguments.rooms:
+        photos = [view.read() for view in of_rooms(folder) if view.number == 0]
+        # A sky has no depth that a mean relative error could use.
+        yield (
+            folder.name,
+            [replace(frame, valid=frame.valid & (frame.inverse_depth > 0)) for frame in photos],
+        )
 
 
 def guesses(base: LiteBase, frame: Frame) -> dict[str, Tensor]:
@@ -79,6 +92,20 @@ def guesses(base: LiteBase, frame: Frame) -> dict[str, Tensor]:
 
 def score(frame: Frame, guess: Tensor) -> DepthScore:
     return score_depth(guess, 1 / frame.inverse_depth.where(frame.valid, 1.0), frame.valid)
+
+
+def outline_cells(counts: OutlineCounts) -> str:
+    """The table cells of a set's outlines: at the best strength, and F1 at the true strength."""
+    best = counts.best
+    numbers = (
+        f"{best.ratio:g}",
+        f"{best.precision:.3f}",
+        f"{best.recall:.3f}",
+        f"{best.f1:.3f}",
+        f"{counts.at(TRUE_RATIO).f1:.3f}",
+        f"{counts.overlap:.3f}",
+    )
+    return " | ".join(numbers)
 
 
 def standing(base: LiteBase, photos: Path) -> str:
@@ -117,8 +144,10 @@ def main() -> None:
     parser.add_argument("--stereo", type=Path, action="append", default=[])
     parser.add_argument("--rgbd", type=Path, action="append", default=[])
     parser.add_argument("--unit", type=float, action="append", default=[])
+    parser.add_argument("--rooms", type=Path, action="append", default=[])
     parser.add_argument("--last", type=float, default=0.2)
     parser.add_argument("--weights", type=Path)
+    parser.add_argument("--outlines", action="store_true")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--standing", type=Path)
     arguments = parser.parse_args()
@@ -130,6 +159,7 @@ def main() -> None:
     )
     print("|---|---" + "|---:" * 7 + "|")
     rows = []
+    outlines: dict[str, OutlineCounts] = {}
     for name, frames in frames_of(arguments):
         found: dict[str, list[DepthScore]] = {guess: [] for guess in GUESSES}
         shown = range(0, len(frames), max(1, len(frames) // 3))[:3]
@@ -137,6 +167,9 @@ def main() -> None:
             each = guesses(base, frame)
             for guess in GUESSES:
                 found[guess].append(score(frame, each[guess]))
+            if arguments.outlines:
+                counts = compare_outlines(each["lite"], frame.inverse_depth, frame.valid)
+                outlines[name] = outlines[name] + counts if name in outlines else counts
             if number in shown:
                 seen, true = each["lite"], frame.inverse_depth
                 known = colored(true, *ends(true[frame.valid]), frame.valid)
@@ -151,6 +184,14 @@ def main() -> None:
             *(f"{d:.1%}" for d in deltas),
         ]
         print(f"| {name} | {len(frames)} | {' | '.join(cells)} |", flush=True)
+    if outlines:
+        print(
+            f"\n| set | true edges | best strength | precision | recall | F1 | "
+            f"F1 at {TRUE_RATIO:g} | overlap |"
+        )
+        print("|---" + "|---:" * 7 + "|")
+        for name, counts in outlines.items():
+            print(f"| {name} | {counts.true} | {outline_cells(counts)} |", flush=True)
     if arguments.standing:
         print(f"\n{standing(base, arguments.standing)}", flush=True)
     print(f"\n640×480: {seconds(base):.3f} s on {torch.get_num_threads()} threads")

@@ -142,6 +142,14 @@ def align(values: Tensor, true: Tensor) -> Tensor:
     """[N] a·values + b with the least-squares distance to `true` [N]; the mean of `true` if all
     values are equal.
     """
+    scale, shift = scale_and_shift(values, true)
+    return scale * values + shift
+
+
+def scale_and_shift(values: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
+    """[] a and [] b of the a·values + b with the least-squares distance to `true`, both [N]; a is 0
+    if all values are equal.
+    """
     v, t = values - values.mean(), true - true.mean()
     spread = (v * v).sum()
     scale = (
@@ -149,7 +157,7 @@ def align(values: Tensor, true: Tensor) -> Tensor:
         if spread > 1e-12 * len(v) * values.abs().max() ** 2
         else v.new_zeros(())
     )
-    return scale * v + true.mean()
+    return scale, true.mean() - scale * values.mean()
 
 
 def vertical_ramp(height: int, width: int) -> Tensor:
