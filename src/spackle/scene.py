@@ -253,6 +253,14 @@ class Scene:
         `name` is the title on the page, `note` a line for the user below it; `viewed_as` is the
         description of a former state of the scene, whose lens and paths the page keeps.
         """
+        # Only a completed photo has a border beyond which things are made up. An edited scene keeps
+        # the framing that it has, and a scene behind the camera is refused by `page_scene`.
+        framing = None
+        is_before_camera = bool((self.base.means[:, 2] > 0).any())
+        if self.disparity is not None and viewed_as is None and is_before_camera:
+            framing = PathOptions().choose_framing(
+                self.base, self.camera, self.depth_range, self.disparity, get_renderer()
+            )
         return page_scene(
             name,
             self.base,
@@ -261,6 +269,7 @@ class Scene:
             self.disparity,
             note,
             is_metric=self.is_metric,
+            framing=framing,
             viewed_as=viewed_as,
         )
 

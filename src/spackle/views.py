@@ -26,6 +26,7 @@ from spackle.core.trajectories import (
     MAX_DISPARITY,
     TRAJECTORIES,
     DepthRange,
+    Framing,
     TrajectoryKind,
     leftmost_and_rightmost,
     trajectory_cameras,
@@ -39,7 +40,7 @@ from spackle.residual.features import hole_area_ratio
 from spackle.runtime.declared_options import MAX_FRAME_COUNT as MAX_FRAME_COUNT
 from spackle.runtime.errors import InputError, as_input_error, check_name
 from spackle.video.frames import SAME_ASPECT_TOLERANCE, FrameMaker
-from spackle.video.framing import COARSE_SIDE_PX, SIDEWAYS, Framing, choose_framing
+from spackle.video.framing import COARSE_SIDE_PX, SIDEWAYS, choose_framing
 from spackle.video.options import VideoOptions
 
 DEFAULT_FRAME_COUNT = 60  # cameras of `Scene.path`; of a longer path, 60 to 119 frames are filled

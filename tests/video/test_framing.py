@@ -8,14 +8,18 @@ from helpers.scenes import box_before_wall
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import DEFAULT_OVERSCAN, DepthRange, leftmost_and_rightmost
+from spackle.core.trajectories import (
+    DEFAULT_OVERSCAN,
+    DepthRange,
+    Framing,
+    leftmost_and_rightmost,
+)
 from spackle.render import CpuRenderer
 from spackle.residual.features import hole_mask
 from spackle.video.framing import (
     MAX_BEYOND_RATIO,
     MIN_COVERED_ALPHA,
     OVERSCANS,
-    Framing,
     choose_framing,
     open_to_border,
 )

@@ -35,6 +35,7 @@ from spackle.formats.html import PageScene, page_scene, read_page_file, single_h
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.scene import Scene
+from spackle.views import PathOptions
 from spackle.web.guard import MAX_UPLOAD_BYTES
 from spackle.web.work import SceneWork
 
@@ -58,6 +59,22 @@ def box() -> Scene:
 @functools.cache
 def page_of_box(name: str = "Box") -> PageScene:
     return page_scene(name, box().base, box().aux, box().camera, 0.35, is_metric=box().is_metric)
+
+
+def test_the_page_looks_where_the_video_looks() -> None:
+    scene = dataclasses.replace(box(), disparity=0.35)
+    usual = scene.depth_range.focus
+    framing = PathOptions().choose_framing(scene.base, scene.camera, scene.depth_range, 0.35, CPU)
+    assert framing.focus > usual  # else the test would show nothing
+    page = scene.page("Box").description
+    assert page["focus"] == framing.focus
+    wanted = scene.camera.zoomed(1 + max(framing.overscan, DEFAULT_OVERSCAN))
+    lens: Any = page["camera"]
+    assert lens["K"] == wanted.K.tolist()
+    # What is edited later keeps its framing, and a scene of another program has none.
+    former = {**page, "focus": 1.25}
+    assert scene.page("Box", viewed_as=former).description["focus"] == 1.25
+    assert box().page("Box").description["focus"] == usual
 
 
 def test_the_built_page_belongs_to_its_sources() -> None:

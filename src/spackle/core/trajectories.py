@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -90,6 +90,17 @@ class DepthRange:
             near=self.near * (other.near / self.near) ** part,
             focus=self.focus * (other.focus / self.focus) ** part,
         )
+
+
+class Framing(NamedTuple):
+    """Where a path's cameras look, and how much of the border they cut off."""
+
+    focus: float  # depth of the target, straight ahead in the photo, in the scene's unit
+    overscan: float  # relative gain in focal length
+
+    def of(self, depth_range: DepthRange) -> DepthRange:
+        """The depths of a path whose cameras look at this target."""
+        return dataclasses.replace(depth_range, focus=self.focus)
 
 
 def disparity_to_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> float:

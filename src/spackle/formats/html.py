@@ -33,6 +33,7 @@ from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     SHARP_TRAJECTORIES,
     DepthRange,
+    Framing,
     TrajectoryKind,
     disparity_to_offset,
     trajectory_cameras,
@@ -122,6 +123,7 @@ def page_scene(
     note: str = "",
     *,
     is_metric: bool = False,
+    framing: Framing | None = None,
     viewed_as: Mapping[str, Any] | None = None,
 ) -> PageScene:
     """Prepare a scene for the page.
@@ -141,6 +143,8 @@ def page_scene(
         note: a text for the user; empty for none. The page shows the whole text for some seconds,
             and then only its beginning, up to the first semicolon.
         is_metric: whether the scene's unit is known to be the metre.
+        framing: the target and the zoom of a completed scene's video, in the scene's unit, which
+            hide most of what was made up beyond the photo's border. None: the usual ones.
         viewed_as: the description of a former state of the scene, whose lens, paths and unit of
             length the page keeps: nothing but the Gaussians changes for its user.
 
@@ -158,14 +162,20 @@ def page_scene(
     else:
         length_factor = float(viewed_as.get("lengthFactor", 1))
     depths = DepthRange.of(base, is_metric=is_metric)
+    if framing is not None:
+        depths = framing.of(depths)
     depths = DepthRange(near=depths.near * length_factor, focus=depths.focus * length_factor)
     if length_factor != 1:
         base = base.scaled(length_factor)
         aux = aux.scaled(length_factor)
     limit = _movement_limit(disparity, is_filled=len(aux) > 0)
     # A scene that Spackle completed is shown enlarged a little, as its videos are, which hides
-    # most of what was filled in beyond the photo's border.
-    shown_camera = camera if disparity is None else camera.zoomed(1 + DEFAULT_OVERSCAN)
+    # most of what was filled in beyond the photo's border. A video that goes to the sides alone may
+    # need less than usual, but the page's user goes up and down as well.
+    overscan = 0.0 if disparity is None else DEFAULT_OVERSCAN
+    if framing is not None:
+        overscan = max(overscan, framing.overscan)
+    shown_camera = camera.zoomed(1 + overscan)
 
     files, layers = _encode_layers({"base": base, "aux": aux})
     # How far a disparity of 1 moves the page's camera, in metres.

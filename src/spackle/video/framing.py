@@ -6,10 +6,8 @@ less of it if it looks at the depth of what stands at the border, and if it zoom
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +19,7 @@ from spackle.core.photo import working_size
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     DepthRange,
+    Framing,
     TrajectoryKind,
     trajectory_cameras,
 )
@@ -44,17 +43,6 @@ COARSE_SIDE_PX = 240
 # A coarse pixel that the photo's border cuts in two is half covered.
 MIN_COVERED_ALPHA = 0.5
 MARGIN_RATIO = 0.15  # by which these are wider and higher than the views, on each side
-
-
-class Framing(NamedTuple):
-    """Where a path's cameras look, and how much of the border they cut off."""
-
-    focus: float  # depth of the target, straight ahead in the photo, in the scene's unit
-    overscan: float  # relative gain in focal length
-
-    def of(self, depth_range: DepthRange) -> DepthRange:
-        """The depths of a path whose cameras look at this target."""
-        return dataclasses.replace(depth_range, focus=self.focus)
 
 
 @torch.no_grad()
