@@ -210,8 +210,17 @@ def test_without_ray_the_option_says_what_to_install(
     assert done.lines[-1] == "error: --ray needs Ray: pip install 'spackle-nvs[ray]'"
 
 
-def test_a_cluster_for_one_command_opens_no_dashboard(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The dashboard would take jobs from everybody who can reach its port."""
+@pytest.mark.parametrize(
+    ("address", "says", "has_dashboard"),
+    [
+        # A dashboard would take jobs from everybody who can reach its port.
+        ("local", "no cluster starts here .not here.: try again", False),
+        ("10.0.0.1:6379", "no cluster answers .not here.: start one", None),
+    ],
+)
+def test_a_cluster_that_does_not_start_or_answer_is_a_line(
+    monkeypatch: pytest.MonkeyPatch, address: str, says: str, has_dashboard: bool | None
+) -> None:
     words: dict[str, object] = {}
 
     def init(**given: object) -> None:
@@ -219,11 +228,11 @@ def test_a_cluster_for_one_command_opens_no_dashboard(monkeypatch: pytest.Monkey
         raise OSError("not here")
 
     monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
-    workers = WorkerOptions(count=1, threads=1, gpu=False, ray="local")
+    workers = WorkerOptions(count=1, threads=1, gpu=False, ray=address)
     mapped = parallel_map(RayWorker, [1], lambda: False, workers, Path())
-    with pytest.raises(InputError, match="no cluster answers"), mapped:
+    with pytest.raises(InputError, match=says), mapped:
         pass
-    assert words["include_dashboard"] is False
+    assert words.get("include_dashboard") is has_dashboard
 
 
 @pytest.mark.parametrize(

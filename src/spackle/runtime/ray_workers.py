@@ -118,10 +118,16 @@ def _connect(address: str) -> Any:
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own_cluster)
     except Exception as error:  # Ray raises errors of many kinds here
-        raise InputError(
-            f"`ray` {address}: no cluster answers ({reason_in_a_line(error)}): "
-            "start one with `ray start --head`, or give `ray` local"
-        ) from error
+        reason = reason_in_a_line(error)
+        if address == "local":
+            # Ray gives its processes half a minute to start, whatever else the machine does.
+            message = f"no cluster starts here ({reason}): try again when less else runs"
+        else:
+            message = (
+                f"no cluster answers ({reason}): "
+                "start one with `ray start --head`, or give `ray` local"
+            )
+        raise InputError(f"`ray` {address}: {message}") from error
     finally:
         if in_main_thread:
             signal.signal(signal.SIGTERM, handler)
