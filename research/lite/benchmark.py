@@ -21,14 +21,13 @@ import argparse
 import statistics
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from depth_loss import DepthScore, score_depth, vertical_ramp
 from frames import JUDGED_SIDE, Frame, Measured, of_camera, of_scenes, reduced
-from made_rooms import of_rooms
+from made_rooms import judged_rooms
 from outlines import TRUE_RATIO, OutlineCounts, compare_outlines
 from standing import StandingScore, labelled_scene, score_standing
 from synthetic_scenes import PhotoDraw
@@ -72,12 +71,7 @@ def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]
         )[1]
         yield folder.name, [file.read(JUDGED_SIDE) for file in files]
     for folder in arguments.rooms:
-        photos = [view.read() for view in of_rooms(folder) if view.number == 0]
-        # A sky has no depth that a mean relative error could use.
-        yield (
-            folder.name,
-            [replace(frame, valid=frame.valid & (frame.inverse_depth > 0)) for frame in photos],
-        )
+        yield folder.name, [room.read(JUDGED_SIDE) for room in judged_rooms(folder)]
 
 
 def guesses(base: LiteBase, frame: Frame) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -187,6 +187,11 @@ class Measured:
         """The frame's name in messages."""
         return f"{self.path} (right)" if self.right else str(self.path)
 
+    @property
+    def identity(self) -> tuple[str | float | None, ...]:
+        """What the digest of a run's data says of the frame."""
+        return self.path.name, self.unit_m, self.right
+
     def read(self, side: int) -> Frame:
         """Read the frame, with at most `side` pixels on the longer side; InputError if that
         fails.
@@ -203,6 +208,23 @@ class Measured:
         return reduced(pair.right, *warp_to_right(stored.depth, stored.valid, shift), side)
 
 
+class Readable(Protocol):
+    """A frame on disk."""
+
+    @property
+    def name(self) -> str:
+        """The frame's name in messages."""
+
+    @property
+    def identity(self) -> tuple[str | float | None, ...]:
+        """What the digest of a run's data says of the frame."""
+
+    def read(self, side: int) -> Frame:
+        """Read the frame, with at most `side` pixels on the longer side; InputError if that
+        fails.
+        """
+
+
 @dataclasses.dataclass(frozen=True)
 class Group:
     """Similar validation frames; the score is a mean over groups, so that each group counts the
@@ -210,7 +232,7 @@ class Group:
     """
 
     name: str
-    files: Sequence[Measured]
+    files: Sequence[Readable]
 
 
 def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Measured]]:
@@ -242,7 +264,7 @@ def of_scenes(folder: Path, key: str, *, right: bool = False) -> list[Measured]:
 
 
 def read_all(
-    files: Sequence[Measured], side: int, warn: Callable[[str], None]
+    files: Sequence[Readable], side: int, warn: Callable[[str], None]
 ) -> list[tuple[str, Frame]]:
     """Read frames; returns them with their names. Unreadable ones are skipped and reported to
     `warn`.
@@ -262,7 +284,7 @@ def read_all(
         else:
             warn(f"passed over: {file.name}: hardly a pixel has a depth")
     if not frames:
-        raise InputError(f"{files[0].path}: none of {len(files)} frames can be read: see above")
+        raise InputError(f"{files[0].name}: none of {len(files)} frames can be read: see above")
     return frames
 
 

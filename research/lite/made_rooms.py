@@ -73,10 +73,43 @@ class Rooms:
         return f"room {view.name}", view.read()
 
 
-def of_rooms(folder: Path) -> list[RoomView]:
-    """All views of all rooms below a folder; InputError if there are none, or one is damaged."""
+@dataclasses.dataclass(frozen=True)
+class JudgedRoom:
+    """A room's photo for validation."""
+
+    view: RoomView
+
+    @property
+    def name(self) -> str:
+        """The photo's name in messages."""
+        return self.view.name
+
+    @property
+    def identity(self) -> tuple[str | int, ...]:
+        """What the digest of a run's data says of the photo."""
+        return self.view.archive.name, self.view.key, self.view.number
+
+    def read(self, side: int) -> Frame:
+        """Read the photo, whose longer side has less than `side` pixels; the sky counts as unknown,
+        because the score compares depths.
+        """
+        frame = self.view.read()
+        return dataclasses.replace(frame, valid=frame.valid & (frame.inverse_depth > 0))
+
+
+def judged_rooms(folder: Path) -> list[JudgedRoom]:
+    """The photos of all rooms below a folder for validation; InputError as from `of_rooms`."""
+    views = of_rooms(folder, "data.validation_worlds")
+    return [JudgedRoom(view) for view in views if view.number == 0]
+
+
+def of_rooms(folder: Path, key: str = "data.worlds") -> list[RoomView]:
+    """All views of all rooms below a folder; InputError if there are none, or one is damaged.
+
+    `key` names the folder in messages.
+    """
     views = []
-    for archive in find_files(folder, "data.worlds", (".tar",), "archives worlds-NNNNN.tar"):
+    for archive in find_files(folder, key, (".tar",), "archives worlds-NNNNN.tar"):
         if not archive.name.startswith(ARCHIVES):
             continue
         with (

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated
 
 from depth_loss import DepthLossWeights
-from frames import Group, Measured, of_camera, of_scenes
-from made_rooms import RoomView, of_rooms
+from frames import Group, Measured, Readable, of_camera, of_scenes
+from made_rooms import RoomView, judged_rooms, of_rooms
 from pydantic import Field
 
 from spackle.bases.lite import SIDE_MULTIPLE, STAGES, EncoderSize
@@ -76,6 +76,9 @@ class LiteData(RecipePart):
     validation_stereo: OptionalPath = (
         None  # scenes for validation; all scenes of `stereo` are for training
     )
+    validation_worlds: OptionalPath = (
+        None  # furnished rooms for validation; all rooms of `worlds` are for training
+    )
 
 
 class LiteOptim(OptimRecipe):
@@ -103,6 +106,17 @@ class LiteRecipe(AnyRecipe):
 
 SCENES_VERSION = 5  # increases whenever the same photos would give different scenes
 GUESSES_VERSION = 1  # the same for guesses by the same weights
+# Keys of LiteData that say where files lie; only the files' names are part of the digest.
+PLACES = (
+    "photos",
+    "stereo",
+    "worlds",
+    "validation_stereo",
+    "validation_worlds",
+    "cache",
+    "rgbd",
+    "teacher",
+)
 STEREO = "stereo"  # the name of the group of data.validation_stereo
 
 
@@ -138,7 +152,22 @@ class LiteFiles:
             groups.append(
                 Group(STEREO, of_scenes(data.validation_stereo, "data.validation_stereo"))
             )
-            _check_apart(stereo, groups[-1].files, data.validation_stereo)
+            _check_apart(
+                [file.path for file in stereo],
+                [file.path for file in groups[-1].files if isinstance(file, Measured)],
+                f"{data.validation_stereo}: data.validation_stereo has scenes of data.stereo",
+            )
+        rooms: Sequence[RoomView] = ()
+        if shares.worlds and data.worlds is not None:
+            rooms = of_rooms(data.worlds)
+        if data.validation_worlds is not None:
+            photos_of_rooms = judged_rooms(data.validation_worlds)
+            groups.append(Group("rooms", photos_of_rooms))
+            _check_apart(
+                [view.archive for view in rooms],
+                [room.view.archive for room in photos_of_rooms],
+                f"{data.validation_worlds}: data.validation_worlds has rooms of data.worlds",
+            )
         if data.teacher is not None and not data.teacher.is_file():
             raise InputError(f"{data.teacher}: no such file, but data.teacher names it")
         files = LiteFiles(
@@ -147,7 +176,7 @@ class LiteFiles:
             stereo if shares.stereo else (),
             rgbd if shares.rgbd else (),
             _spread(photos, data.guesses) if shares.guessed and data.teacher is not None else (),
-            of_rooms(data.worlds) if shares.worlds and data.worlds is not None else (),
+            rooms,
             _with_own_names([group for group in groups if group.files]),
         )
         if not (files.photos or files.stereo or files.rgbd or files.guessed or files.worlds):
@@ -159,7 +188,7 @@ class LiteFiles:
             raise InputError(
                 "the recipe has nothing to judge the network by: give data.rgbd with a share in "
                 "data.validation, "
-                "or scenes as data.validation_stereo=FOLDER"
+                "scenes as data.validation_stereo=FOLDER, or rooms as data.validation_worlds=FOLDER"
             )
         return files
 
@@ -193,7 +222,7 @@ class LiteFiles:
     def digest(self) -> str:
         """Twelve digits that identify all training and validation data."""
         facts = self.data.model_dump(mode="json")
-        for name in ("photos", "stereo", "worlds", "validation_stereo", "cache", "rgbd", "teacher"):
+        for name in PLACES:
             facts.pop(name)
         names = [
             _names(files)
@@ -212,12 +241,11 @@ def _spread(photos: Sequence[Path], count: int) -> Sequence[Path]:
     )
 
 
-def _check_apart(learned: Sequence[Measured], judged: Sequence[Measured], folder: Path) -> None:
-    """InputError if a scene is used for both training and validation."""
-    if both := {file.path.resolve() for file in learned} & {file.path.resolve() for file in judged}:
-        raise InputError(
-            f"{folder}: data.validation_stereo has scenes of data.stereo in it, such as {min(both)}"
-        )
+def _check_apart(learned: Sequence[Path], judged: Sequence[Path], fault: str) -> None:
+    """InputError, which begins with `fault`, if a file is used for both training and validation."""
+    both = {path.resolve() for path in learned} & {path.resolve() for path in judged}
+    if both:
+        raise InputError(f"{fault} in it, such as {min(both)}")
 
 
 def _with_own_names(groups: Sequence[Group]) -> list[Group]:
@@ -232,5 +260,5 @@ def _with_own_names(groups: Sequence[Group]) -> list[Group]:
     return list(named.values())
 
 
-def _names(files: Sequence[Measured]) -> list[tuple[str, float | None, bool]]:
-    return [(file.path.name, file.unit_m, file.right) for file in files]
+def _names(files: Sequence[Readable]) -> list[tuple[str | float | None, ...]]:
+    return [file.identity for file in files]

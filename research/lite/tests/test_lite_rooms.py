@@ -97,3 +97,21 @@ def test_a_share_of_0_leaves_rooms_out_and_the_rooms_are_part_of_the_digest(
     assert without.worlds == ()
     write_rooms(tmp_path / "rooms" / "worlds-00001.tar")
     assert LiteFiles.of(data).digest != files.digest
+
+
+def test_rooms_for_validation_are_a_group_without_sky_and_none_that_is_trained_on(
+    tmp_path: Path,
+) -> None:
+    for folder in ("learned", "held"):
+        (tmp_path / folder).mkdir()
+        write_rooms(tmp_path / folder / f"worlds-{folder}.tar")
+    data = LiteData(worlds=tmp_path / "learned", validation_worlds=tmp_path / "held")
+    (group,) = LiteFiles.of(data).groups
+    assert group.name == "rooms"
+    (photo,) = group.files
+    valid = photo.read(768).valid
+    assert bool(valid[10, 2])
+    assert not bool(valid[0, 0])  # sky
+
+    with pytest.raises(InputError, match=r"validation_worlds has rooms of data\.worlds"):
+        LiteFiles.of(data.model_copy(update={"validation_worlds": tmp_path / "learned"}))
