@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,7 @@ JOURNEYS = (
     "paper/evaluation/test_evaluate.py",
     "paper/training/test_direct_ft.py",
     "test_api.py",
+    "test_documented_lines.py",
     "test_progress.py",
     "test_suggestions.py",
     "bases/test_sharp.py",
@@ -70,6 +72,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 settings.register_profile("repeat", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
+
+
+@pytest.fixture(scope="module")
+def short_paths() -> Iterator[None]:
+    """A path along which nobody says how long it is has 3 frames in place of 120."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spackle.views.DEFAULT_VIDEO_SECONDS", 0.1)
+        yield
 
 
 @pytest.fixture

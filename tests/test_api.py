@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import portraits
-from helpers.command import decode
-from helpers.photos import HEIGHT, WIDTH, box, metres, write_depth, write_pair, write_photo
+from helpers.photos import HEIGHT, WIDTH, box, metres, write_pair, write_photo
 from helpers.scenes import psnr, same_bits
 from PIL import Image
 
@@ -24,33 +23,13 @@ from spackle.bases.settings import BaseSettings
 from spackle.pipeline import Pipeline, PipelineOptions
 from spackle.runtime.progress import LogReporter
 
+pytestmark = pytest.mark.usefixtures("short_paths")
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> spackle.Scene:
     photo, depth = write_pair(tmp_path_factory.mktemp("pair"))
     return spackle.predict(photo, depth)
-
-
-def documented() -> list[str]:
-    """The examples in the package's docstring and in the README."""
-    assert spackle.__doc__ is not None
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    blocks = [block.split("```")[0] for block in readme.split("```python\n")[1:]]
-    return [spackle.__doc__[spackle.__doc__.index("import spackle") :], *blocks]
-
-
-@pytest.mark.parametrize("code", documented(), ids=lambda code: f"{len(code)} characters")
-def test_the_documented_three_lines_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
-) -> None:
-    assert len([line for line in code.splitlines() if line]) == 3
-    write_photo(tmp_path / "photo.jpg")
-    write_depth(tmp_path / "depth.png")
-    monkeypatch.chdir(tmp_path)
-    exec(code, {})
-    frames = decode(Path("video.mp4"))
-    assert len(frames) == 120  # 4 seconds
-    assert (frames[0].width, frames[0].height) == (WIDTH, HEIGHT)
 
 
 def test_every_public_name_is_there_and_no_other() -> None:

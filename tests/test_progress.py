@@ -17,6 +17,7 @@ from spackle.runtime.errors import as_input_error
 from spackle.web.jobs import Job
 from spackle.web.work import SceneWork
 
+pytestmark = pytest.mark.usefixtures("short_paths")
 STAGES = ["prepare", "base", "move", "complete", "measure"]
 
 
@@ -146,7 +147,7 @@ def test_the_server_hears_the_same_as_a_program(pair: tuple[Path, Path], tmp_pat
     photo, depth = pair
     job = Job(id="1", name=photo.name, source=str(photo), depth=str(depth), folder=tmp_path)
     job.results.mkdir()
-    job = job.model_copy(update={"options": {"files": []}})
+    job = job.model_copy(update={"options": {"files": [], "frames": 3}})
     events: list[dict[str, object]] = []
     SceneWork()((job, None), lambda event: events.append(dict(event)))
     stages = dict.fromkeys(event["stage"] for event in events if "stage" in event)

@@ -65,7 +65,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (wheel,) = folder.glob("*.whl")
     venv.create(folder / "venv")
     python = folder / "venv" / "bin" / "python"
-    wanted = ["--no-deps", "--no-index", wheel]
+    wanted = ["--no-deps", "--no-index", "--no-compile", wheel]
     if empty:
         wanted = ["--constraint", ROOT / "constraints.txt", f"{wheel}[train]"]
     subprocess.run(
@@ -74,7 +74,27 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not empty:
         (own,) = (folder / "venv" / "lib").glob("python*/site-packages")
         (own / "borrowed.pth").write_text(sysconfig.get_path("purelib"))
+        share_kernels(own / "spackle")
     return python.parent
+
+
+def share_kernels(installed: Path) -> None:
+    """Let an installed package and the checkout keep their compiled kernels in the same place.
+
+    Numba keeps them beside a source file, and compiles again where the file's size or time is
+    another. To compile all of them once more takes a minute and a half.
+    """
+    for source in (ROOT / "src" / "spackle").rglob("*.py"):
+        copy = installed / source.relative_to(ROOT / "src" / "spackle")
+        assert copy.read_bytes() == source.read_bytes()
+        times = source.stat()
+        os.utime(copy, ns=(times.st_atime_ns, times.st_mtime_ns))
+
+        kernels = copy.parent / "__pycache__"
+        if not kernels.is_symlink():
+            shutil.rmtree(kernels, ignore_errors=True)
+            (source.parent / "__pycache__").mkdir(exist_ok=True)
+            kernels.symlink_to(source.parent / "__pycache__")
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,20 @@ from spackle.runtime.worker_options import WorkerOptions
 from spackle.runtime.workers import parallel_map
 
 chosen: list[int] = []
-if (
-    multiprocessing.current_process().name != "MainProcess"
-):  # a worker imports this module before it starts
-    torch.cuda.device_count = lambda: 2
-    torch.cuda.set_device = chosen.append  # type: ignore[assignment]
+
+
+class OpenWorker:
+    """Opens a worker, in a process whose torch sees two GPUs from the time it gets this object."""
+
+    def __setstate__(self, state: object) -> None:
+        torch.cuda.device_count = lambda: 2
+        torch.cuda.set_device = chosen.append  # type: ignore[assignment]
+
+    def __getstate__(self) -> object:
+        return {"is_sent": True}  # without a state, no process would call `__setstate__`
+
+    def __call__(self) -> Worker:
+        return Worker()
 
 
 class Worker:
@@ -34,7 +43,7 @@ def test_each_process_uses_a_gpu_of_its_own(
     tmp_path: Path, gpu: bool, expected: set[tuple[int, ...]]
 ) -> None:
     workers = WorkerOptions(count=2, threads=1, gpu=gpu)
-    with parallel_map(Worker, [tmp_path] * 4, lambda: False, workers, tmp_path) as results:
+    with parallel_map(OpenWorker(), [tmp_path] * 4, lambda: False, workers, tmp_path) as results:
         assert set(results) == expected
 
 

@@ -109,13 +109,15 @@ def machine_memory() -> int | None:
     return min(sizes)
 
 
-def import_ahead(module: str) -> None:
-    """Have a module imported once for all processes that start from now on, if possible.
+def import_ahead(*modules: str) -> None:
+    """Have modules, and numba, imported once for all processes that start later, where possible.
 
-    Its import must start no thread, because threads do not survive a fork.
+    Their import must start no thread, because threads do not survive a fork. A module that cannot
+    be imported is left to the processes.
     """
     if STARTS_QUICKLY:
-        multiprocessing.get_context("forkserver").set_forkserver_preload([module])
+        names = ["spackle.runtime.loaded_kernels", *modules]
+        multiprocessing.get_context("forkserver").set_forkserver_preload(names)
 
 
 def end_server_that_imports() -> None:

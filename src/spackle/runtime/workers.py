@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
-import multiprocessing
+import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -18,7 +18,7 @@ import torch
 
 from spackle.runtime.device import use_gpu
 from spackle.runtime.errors import InputError
-from spackle.runtime.task_process import end_with_parent
+from spackle.runtime.task_process import end_with_parent, import_ahead, process_context
 from spackle.runtime.worker_options import WorkerOptions
 
 # A process always has its next job at hand; more jobs would keep more results in memory.
@@ -73,22 +73,32 @@ def parallel_map(
             yield map(open_worker().make, jobs)
         return
 
-    spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    # Where processes can be forked from one that has imported all that they need, they start at
+    # once, and share the memory of these modules.
+    import_ahead(__name__, _module_of(open_worker))
+    context = process_context()
     # Each process takes one number, which chooses its GPU; None means no GPU.
-    gpu_numbers = spawn.SimpleQueue()
+    gpu_numbers = context.SimpleQueue()
     for number in range(process_count):
         gpu_numbers.put(number if workers.gpu else None)
 
     pool = ProcessPoolExecutor(
         process_count,
-        spawn,
+        context,
         initializer=_start_process,
-        initargs=(workers.threads, open_worker, gpu_numbers),
+        # The process that is forked may have been started in another environment.
+        initargs=(workers.threads, open_worker, gpu_numbers, dict(os.environ)),
     )
     try:
         yield _results_as_they_arrive(pool, jobs, JOBS_PER_PROCESS * process_count, stop)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _module_of(open_worker: Callable[[], Any]) -> str:
+    """The name of the module that defines a function, or one with some arguments given."""
+    function = open_worker.func if isinstance(open_worker, functools.partial) else open_worker
+    return str(function.__module__)
 
 
 def _results_as_they_arrive(
@@ -131,19 +141,27 @@ def _results_as_they_arrive(
 _get_worker: Callable[[], Any]
 
 
-def _start_process(threads: int, open_worker: Callable[[], Any], gpu_numbers: Any) -> None:
+def _start_process(
+    threads: int,
+    open_worker: Callable[[], Any],
+    gpu_numbers: Any,
+    environment: Mapping[str, str],
+) -> None:
     """Set up a worker process: it ignores Ctrl-C, ends with the main process, and takes a GPU.
 
     Args:
         threads: torch's threads.
         open_worker: makes the object that does the jobs.
         gpu_numbers: a queue that holds one number, or None for no GPU, for each process.
+        environment: replaces the variables of this process.
     """
     # The worker is made at the first job, because only jobs can report errors to the main process.
     global _get_worker
     _get_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process decides what Ctrl-C ends
     threading.Thread(target=end_with_parent, daemon=True).start()
+    os.environ.clear()
+    os.environ.update(environment)
     torch.set_num_threads(threads)
 
     use_gpu(gpu_numbers.get())

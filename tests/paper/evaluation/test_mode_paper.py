@@ -94,6 +94,7 @@ def test_the_pipeline_adds_the_gaussians_of_the_evaluation_bit_for_bit(
     assert min(counts) == MIN_AUX_GAUSSIANS < max(counts)
 
 
+@pytest.mark.usefixtures("short_paths")
 def test_the_command_writes_the_papers_gaussians(tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path / "pair")
     words = ("predict", photo, "--depth", depth, "-o", tmp_path, "--no-render", "--mode", "paper")
