@@ -40,7 +40,8 @@ WARM_COUNT = 100  # photos after which caches are full; costs are those of the p
 POLL_SECONDS = 0.1  # between two looks at the processes
 BYTES_PER_MB = 1e6
 MS_PER_S = 1000
-FIGURE_INCHES = (6.0, 2.6)
+FIGURE_INCHES = (7.0, 2.2)
+MARGIN = 1.2  # height of the axes over the highest value
 
 
 class Flat:
@@ -187,15 +188,20 @@ def draw_memory(runs: Mapping[str, Sequence[Sample]], file: Path) -> None:
     from matplotlib import pyplot
 
     with mpl.rc_context(MATPLOTLIB_SETTINGS):
-        figure, axes = pyplot.subplots(figsize=FIGURE_INCHES, layout="constrained")
-        for title, samples in runs.items():
+        # A panel for each run, because their lines would hide each other.
+        figure, panels = pyplot.subplots(
+            ncols=len(runs), sharey=True, squeeze=False, figsize=FIGURE_INCHES, layout="constrained"
+        )
+        for axes, (title, samples) in zip(panels[0], runs.items(), strict=True):
             counts = [sample.photo_count for sample in samples]
-            axes.plot(counts, [sample.command_mb for sample in samples], label=title)
-        axes.set_xlabel("photos done")
-        axes.set_ylabel("MB of the command")
-        axes.set_xlim(left=0)
-        axes.set_ylim(bottom=0)
-        figure.legend(loc="outside right upper", frameon=False)
+            axes.plot(counts, [sample.command_mb for sample in samples])
+            axes.set_title(title)
+            axes.set_xlim(0, counts[-1])
+            axes.set_xticks([0, counts[-1]])
+        highest = max(sample.command_mb for samples in runs.values() for sample in samples)
+        panels[0, 0].set_ylim(0, MARGIN * highest)
+        panels[0, 0].set_ylabel("MB of the command")
+        figure.supxlabel("photos done", fontsize="medium")
         figure.savefig(file, metadata={"Date": None})  # equal numbers make equal bytes
         pyplot.close(figure)
 
