@@ -10,7 +10,8 @@ from helpers.command import decode, names_in, refuses, report_of, run
 from helpers.photos import read_ply
 from PIL import Image
 
-SIZE = (741, 500)  # of the photo
+from spackle.paper.evaluation.datasets import stereo
+
 INPAINTING = "2D inpainting (biharmonic)"
 SPACKLE, TRAINED = "Spackle (initial Gaussians)", "Spackle (trained)"
 
@@ -21,10 +22,28 @@ def size_of(path: Path) -> tuple[int, int]:
         return image.size
 
 
+def even(count: int) -> int:
+    """The number itself, or the next one, as videos need it."""
+    return count + count % 2
+
+
+def shrink_the_photos(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Let the demo get every `step`-th pixel, each way, of its photos."""
+    data = pytest.importorskip("skimage.data")
+    left, right, disparity = (values[::step, ::step] for values in data.stereo_motorcycle())
+    monkeypatch.setattr(data, "stereo_motorcycle", lambda: (left, right, disparity / step))
+    for name in ("FOCAL", "CX", "CY", "DOFFS"):
+        constant = f"MOTORCYCLE_{name}_PX"
+        monkeypatch.setattr(stereo, constant, getattr(stereo, constant) / step)
+
+
+@pytest.mark.parametrize(
+    ("step", "size"), [(4, (186, 125)), pytest.param(1, (741, 500), marks=pytest.mark.slow)]
+)
 def test_the_demo_fills_the_hole_better_than_2d_inpainting(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int, size: tuple[int, int]
 ) -> None:
-    pytest.importorskip("skimage.data")
+    shrink_the_photos(monkeypatch, step)
     monkeypatch.setattr("spackle.views.DEFAULT_VIDEO_SECONDS", 1.0)  # of the video
     monkeypatch.setattr("spackle.results.many_photos.is_compiled", lambda kernel: False)
     folder = tmp_path / "out"
@@ -47,14 +66,11 @@ def test_the_demo_fills_the_hole_better_than_2d_inpainting(
         report["base_gaussians"],
         report["aux_gaussians"],
     )
-    assert size_of(folder / "right_view.png") == size_of(folder / "right_photo.png") == SIZE
-    assert size_of(folder / "comparison.png") == (2 * SIZE[0] + 2, 2 * SIZE[1])  # made even
+    assert size_of(folder / "right_view.png") == size_of(folder / "right_photo.png") == size
+    width, height = map(even, size)
+    assert size_of(folder / "comparison.png") == (2 * width, 2 * height)
     frames = decode(folder / "video.mp4")
-    assert (len(frames), frames[0].width, frames[0].height) == (
-        30,
-        SIZE[0] + 1,
-        SIZE[1],
-    )  # made even
+    assert (len(frames), frames[0].width, frames[0].height) == (30, width, height)
     # The perceptual distance needs weights; without them the command says how to get them.
     assert report["right_camera"]["distance"] == {}
     assert "`spackle weights get squeezenet`" in result.err

@@ -35,11 +35,14 @@ from spackle.web.jobs import WARM_UP
 from spackle.web.work import ROUGH_DEPTH_NOTE, SceneWork
 from spackle.weights import PUBLISHED_WEIGHTS
 
+SHORT = {"frames": 8}  # of each video, and of the path that is filled
+
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("scenes")
-    with served(folder, work=PatientWork(), max_bytes=MAX_UPLOAD_BYTES) as server:
+    work = PatientWork(default_options=SHORT)
+    with served(folder, work=work, max_bytes=MAX_UPLOAD_BYTES) as server:
         yield server
 
 
@@ -309,7 +312,7 @@ def test_a_phones_photos_become_scenes(visit: Opened) -> None:
 
 def test_a_first_photo_waits_for_the_warm_up(browser: Any, tmp_path: Path) -> None:
     go_on = tmp_path / "go-on"
-    work = SlowStart(go_on=go_on)
+    work = SlowStart(default_options=SHORT, go_on=go_on)
     with served(tmp_path / "scenes", work=work, max_bytes=MAX_UPLOAD_BYTES) as server:
         server.jobs.warm_up()
         page = opened(browser, address(server)).page
