@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 from collections.abc import Callable
@@ -40,7 +41,11 @@ def die_if_told(photo: Path) -> None:
     order = photo.with_suffix(".kill")
     if not order.exists():
         return
-    number = {"worker": os.getpid(), "command": os.getppid()}[order.read_text()]
+    # Not the system's parent, which may be a server that forks processes for the command.
+    command = multiprocessing.parent_process()
+    assert command is not None
+    assert command.pid is not None
+    number = {"worker": os.getpid(), "command": command.pid}[order.read_text()]
     order.unlink()
     os.kill(number, signal.SIGKILL)
 
