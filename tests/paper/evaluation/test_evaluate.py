@@ -487,6 +487,20 @@ def test_a_run_resumes_to_the_same_bytes_and_runs_share_tables(
         refuses(run("tables", damaged, "-o", both), file, "run the command again")
 
 
+@pytest.mark.slow
+def test_two_workers_write_the_bytes_of_one_process(scenes: Path, tmp_path: Path) -> None:
+    choices = ("--methods", "base,initial", "--metrics", "none", "--disparity", "0.3")
+    one = tmp_path / "one"
+    two = tmp_path / "two"
+    # The last bits depend on the number of threads.
+    for output, count in ((one, 1), (two, 2)):
+        done = evaluate(scenes, output, *choices, "--workers", count, "--threads", 1)
+        assert done.code == 0, done.err
+    assert names_in(two) == names_in(one)
+    for name in ("rows.jsonl", "worst.png", "best.png", *TABLES):
+        assert (one / name).read_bytes() == (two / name).read_bytes(), name
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
