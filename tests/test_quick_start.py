@@ -21,7 +21,12 @@ from helpers.photos import write_photo
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")
-SHORTER = {"train": ["optim.steps=10", "data.views=4", "data.validation_views=1", "data.cells=16"]}
+SHORTER = {
+    "train": [
+        *("optim.steps=3", "optim.warmup=1", "optim.batch=1", "run.validate_every=3"),
+        *("data.views=4", "data.validation_views=1", "data.cells=16"),
+    ]
+}
 SHORTER |= {"predict": ["--frames", "4"], "render": ["--frames", "4"]}
 ALONE = {
     name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "NUMBA"))

@@ -1,4 +1,4 @@
-"""Work that makes scenes as the server does, but never ends for photos called "slow"."""
+"""Work that makes scenes as the server does, but takes longer, or makes less."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from spackle.web.jobs import WARM_UP
 from spackle.web.work import SceneWork
@@ -35,4 +36,16 @@ class SlowStart(SceneWork):
             while not self.go_on.exists():
                 time.sleep(0.01)
         else:
+            super().__call__(task, send_event)
+
+
+@dataclasses.dataclass
+class BriefWork(SceneWork):
+    """`SceneWork` whose videos for sharing have a length of one's choice."""
+
+    shared_seconds: float = 2.0
+
+    def __call__(self, task: Any, send_event: Any) -> None:
+        """Do a task."""
+        with mock.patch("spackle.web.shared_videos.SHARED_SECONDS", self.shared_seconds):
             super().__call__(task, send_event)

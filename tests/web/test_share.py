@@ -11,14 +11,14 @@ from typing import Any
 import av
 import pytest
 from helpers.browser import opened, settled
+from helpers.patient_work import BriefWork
 from helpers.photos import write_pair
 from helpers.web_client import served
 from PIL import Image
 
 from spackle.core.camera import Camera
 from spackle.web.guard import MAX_UPLOAD_BYTES
-from spackle.web.shared_videos import shared_video_options
-from spackle.web.work import SceneWork
+from spackle.web.shared_videos import SHARED_SECONDS, shared_video_options
 
 # A phone's menu for sending, which keeps what it was given.
 SEND_MENU = """
@@ -41,12 +41,20 @@ NOTE_PROGRESS = """() => {
 }"""
 
 
+@pytest.fixture(scope="module", params=[2.0, pytest.param(5.0, marks=pytest.mark.slow)])
+def seconds(request: pytest.FixtureRequest) -> float:
+    """The length of a video for sharing: less than people get, and in slow tests what they get."""
+    length: float = request.param
+    return length
+
+
 @pytest.fixture(scope="module")
-def page(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def page(browser: Any, tmp_path_factory: pytest.TempPathFactory, seconds: float) -> Iterator[Any]:
     """The page of a server with a small scene, and its dialog open."""
     folder = tmp_path_factory.mktemp("share")
     photo, depth = write_pair(folder / "pair")
-    with served(folder / "scenes", work=SceneWork(), max_bytes=MAX_UPLOAD_BYTES) as server:
+    work = BriefWork(default_options={"frames": 8}, shared_seconds=seconds)
+    with served(folder / "scenes", work=work, max_bytes=MAX_UPLOAD_BYTES) as server:
         address = f"http://127.0.0.1:{server.port}{server.root}/"
         found = opened(browser, address)
         page = found.page
@@ -84,8 +92,8 @@ def saved(page: Any) -> tuple[str, bytes]:
         pytest.param("Wide", "wide", (1280, 720), marks=pytest.mark.slow),
     ],
 )
-def test_a_video_has_the_shape_of_where_it_goes_and_lasts_five_seconds(
-    page: Any, label: str, shape: str, size: tuple[int, int]
+def test_a_video_has_the_shape_of_where_it_goes_and_its_length(
+    page: Any, seconds: float, label: str, shape: str, size: tuple[int, int]
 ) -> None:
     choose(page, label)
     choose(page, "Video (MP4)")
@@ -94,10 +102,14 @@ def test_a_video_has_the_shape_of_where_it_goes_and_lasts_five_seconds(
     with av.open(io.BytesIO(content)) as video:
         stream = video.streams.video[0]
         assert (stream.width, stream.height) == size
-        assert float(stream.duration * stream.time_base) == pytest.approx(5, abs=0.05)
+        assert float(stream.duration * stream.time_base) == pytest.approx(seconds, abs=0.05)
 
 
-def test_a_gif_has_the_shape_and_plays_for_ever(page: Any) -> None:
+def test_people_get_five_seconds() -> None:
+    assert SHARED_SECONDS == 5
+
+
+def test_a_gif_has_the_shape_and_plays_for_ever(page: Any, seconds: float) -> None:
     choose(page, "Story")
     choose(page, "GIF, small")
     page.evaluate(NOTE_PROGRESS)
@@ -116,7 +128,8 @@ def test_a_gif_has_the_shape_and_plays_for_ever(page: Any) -> None:
         for index in range(gif.n_frames):
             gif.seek(index)
             lengths.append(gif.info["duration"])
-    assert sum(lengths) / 1000 == pytest.approx(5, abs=0.4)  # a GIF counts hundredths of a second
+    # A GIF counts hundredths of a second.
+    assert sum(lengths) / 1000 == pytest.approx(seconds, rel=0.08)
 
 
 def test_a_page_is_saved_with_its_caption_and_sent_at_the_second_press(
