@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 from collections.abc import Iterator
@@ -55,14 +56,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of `JOURNEYS`, and run them first, in their order."""
     journeys = [Path(__file__).parent / name for name in JOURNEYS]
 
-    def place(item: pytest.Item) -> int:
-        """The place of a test's file in `JOURNEYS`; their number, if it is in none."""
+    @functools.cache
+    def place(file: Path) -> int:
+        """The place of a file in `JOURNEYS`; their number, if it is in none."""
         for index, journey in enumerate(journeys):
-            if item.path == journey or journey in item.path.parents:
+            if file == journey or journey in file.parents:
                 return index
         return len(journeys)
 
-    places = {item: place(item) for item in items}
+    places = {item: place(item.path) for item in items}
     for item in items:
         if places[item] < len(journeys):
             item.add_marker("journey")

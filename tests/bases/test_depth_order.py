@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 
 import spackle
 from spackle.bases.depth_order import (
@@ -36,6 +35,8 @@ def disc() -> tuple[Photo, Floats]:
 
 @pytest.mark.parametrize("levels", [2, 7, 1000])
 def test_rank_correlation_is_scipys(levels: int) -> None:
+    from scipy.stats import spearmanr  # only here: every process that collects tests would wait
+
     rng = np.random.default_rng(levels)
     first = rng.integers(0, levels, 300)
     second = first + rng.integers(0, levels, 300)
