@@ -181,7 +181,7 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
     monkeypatch.setattr(MogeBase, "run_network", ask)
     monkeypatch.setattr(
         "spackle.bases.depth.lift_rgbd",
-        lambda *given: (seen.append(given[2].focal[0]), lift_rgbd(*given))[1],
+        lambda *given, **named: (seen.append(given[2].focal[0]), lift_rgbd(*given, **named))[1],
     )
     done = run("predict", CLIPS / "large.mp4", *words, "--residual", "none")
     assert (done.code, report_of(tmp_path / "large")["focal_source"]) == (0, "MoGe"), done.err

@@ -90,7 +90,7 @@ def maps(monkeypatch: pytest.MonkeyPatch) -> list[DepthMap]:
     seen: list[DepthMap] = []
     monkeypatch.setattr(
         "spackle.bases.depth.lift_rgbd",
-        lambda rgb, depth, camera: (seen.append(depth), lift_rgbd(rgb, depth, camera))[1],
+        lambda *given, **named: (seen.append(given[1]), lift_rgbd(*given, **named))[1],
     )
     return seen
 

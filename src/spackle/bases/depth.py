@@ -92,24 +92,36 @@ class RgbdBase:
         return depth, camera
 
 
-def lift_predicted_depth(photo: Photo, depth: DepthMap, camera: Camera) -> BasePrediction:
+def lift_predicted_depth(
+    photo: Photo, depth: DepthMap, camera: Camera, *, outline_growth_px: int = 0
+) -> BasePrediction:
     """Lift a photo with the depth that a network predicts, as `lift_rgbd` does.
 
     First the photo's outermost pixels are replaced by the pixels just inside, because they often
-    show a scan's edge or colours mixed by resizing.
+    show a scan's edge or colours mixed by resizing. If the network misses outlines by some pixels,
+    near surfaces should grow by `outline_growth_px`.
     """
-    prediction = lift_rgbd(replace_border(photo.rgb), depth, camera)
+    prediction = lift_rgbd(
+        replace_border(photo.rgb), depth, camera, outline_growth_px=outline_growth_px
+    )
     # The Gaussians lack the border, but the photo itself is kept as it is.
     return dataclasses.replace(prediction, photo=photo.rgb)
 
 
 def lift_rgbd(
-    rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = TILE_LEVELS
+    rgb: Tensor,
+    depth: DepthMap,
+    camera: Camera,
+    levels: int = TILE_LEVELS,
+    *,
+    outline_growth_px: int = 0,
 ) -> BasePrediction:
     """Turn a photo [H, W, 3] (sRGB in 0..1) and its depth map into Gaussians on the surfaces.
 
     `camera` is the photo's camera. In flat areas, up to 2^levels × 2^levels pixels share a
-    Gaussian; with `levels` = 0, each pixel has its own. InputError if no pixel has a depth.
+    Gaussian; with `levels` = 0, each pixel has its own. At depth steps near surfaces grow by
+    `outline_growth_px` pixels, for a map whose outlines are guessed. InputError if no pixel has a
+    depth.
     """
-    lifted = lift_depth_map(rgb, depth, camera, levels)
+    lifted = lift_depth_map(rgb, depth, camera, levels, outline_growth_px=outline_growth_px)
     return BasePrediction(lifted.gaussians, lifted.camera, lifted.notes, photo=rgb)

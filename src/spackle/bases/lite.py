@@ -313,6 +313,9 @@ MAX_DISPARITY = 0.1
 # Share of the widest views that may be holes: more invented parts would be conspicuous.
 MAX_HOLE_RATIO = 0.075
 MAX_DEPTH_RATIO = 60.0  # depths are limited to this multiple of the nearest depth
+# Objects grow by at least so many of the photo's pixels, and by one of the map's, so that no pixel
+# with their colour stays behind when the camera moves: docs/lab/silhouettes.md.
+MIN_OUTLINE_GROWTH_PX = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -384,7 +387,13 @@ class LiteBase:
             quantity="disparity",
             path=photo.path,
         )
-        prediction = lift_predicted_depth(photo, depth_map, photo.camera)
+        map_pixel_px = max(photo.width, photo.height) / max(depth.shape)
+        prediction = lift_predicted_depth(
+            photo,
+            depth_map,
+            photo.camera,
+            outline_growth_px=max(MIN_OUTLINE_GROWTH_PX, round(map_pixel_px)),
+        )
         notes = {
             **prediction.notes,
             "precision": "fp32",

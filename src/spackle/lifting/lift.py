@@ -13,6 +13,7 @@ from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.depth.depth_map import MIN_DEPTH_M, DepthMap
 from spackle.lifting.edges import find_edges
+from spackle.lifting.guessed_outlines import grow_near_surfaces
 from spackle.lifting.open_pixels import assign_open_pixels
 from spackle.lifting.quadtree import TILE_LEVELS
 from spackle.lifting.resampling import HOLE, SETTLED, resample_map
@@ -31,7 +32,12 @@ class LiftedPhoto:
 
 
 def lift_depth_map(
-    rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = TILE_LEVELS
+    rgb: Tensor,
+    depth: DepthMap,
+    camera: Camera,
+    levels: int = TILE_LEVELS,
+    *,
+    outline_growth_px: int = 0,
 ) -> LiftedPhoto:
     """Lift a photo and its depth map to Gaussians that look like the photo at the photo's camera.
 
@@ -45,6 +51,8 @@ def lift_depth_map(
         camera: the photo's camera, at the world's origin.
         levels: number of tile sizes, from 2×2 pixels on. All pixels of a tile share one Gaussian;
             with 0, every pixel has its own.
+        outline_growth_px: by how many of the photo's pixels near surfaces grow at depth steps, for
+            a map whose outlines are guessed.
 
     Raises:
         InputError: no pixel has a depth.
@@ -77,8 +85,12 @@ def lift_depth_map(
         raise InputError(
             f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map"
         )
-    photo_inverse_depth = torch.from_numpy(assign_open_pixels(resampled, rgb.numpy()))  # [H, W]
-    gaussians = layered_gaussians(photo_inverse_depth, srgb_to_linear(rgb), camera, levels)
+    assigned = assign_open_pixels(resampled, rgb.numpy())  # [H, W]
+    photo_inverse_depth = torch.from_numpy(grow_near_surfaces(assigned, outline_growth_px))
+    # Outlines that have grown lie in the background: their pixels are no mixtures.
+    gaussians = layered_gaussians(
+        photo_inverse_depth, srgb_to_linear(rgb), camera, levels, unmix=outline_growth_px == 0
+    )
 
     hole_share = float((resampled.state == HOLE).mean())
     notes: dict[str, float | int | str] = {"depth_filled": round(hole_share, 4)}

@@ -46,7 +46,9 @@ class Layers:
     color: Floats  # [2, H, W, 3] linear RGB
 
 
-def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
+def find_layers(
+    inverse_depth: Floats, slope: Floats, colors: Floats, *, unmix: bool = True
+) -> Layers:
     """Find a near colour, a far colour and alpha for each pixel beside a depth step.
 
     They mix to the photo's colour: alpha·near + (1 - alpha)·far. Both surfaces are continued across
@@ -57,6 +59,8 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
         inverse_depth: [H, W] 1/z, positive.
         slope: [H, W, 2] its derivative by pixel x and y.
         colors: [H, W, 3] the photo's linear RGB.
+        unmix: if False, each pixel shows one surface alone, with the photo's colour: outlines that
+            lie in the background (`guessed_outlines.py`) have nothing to separate.
     """
     height, width = inverse_depth.shape
     ring, side_depths = find_step_rings(inverse_depth)
@@ -68,6 +72,10 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
     outline_distance, variance = estimate_surfaces(
         inverse_depth, colors, ring, side_depths, both_depths, both_slopes, both_colors
     )
+
+    if not unmix:
+        is_near = (ring > 0) & (outline_distance > 0)
+        return Layers(ring, is_near.astype(np.float32), both_depths, both_slopes, both_colors)
 
     # … then the coverage that explains the photo best with these colours …
     alpha = np.zeros((height, width), np.float32)

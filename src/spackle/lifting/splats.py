@@ -56,7 +56,12 @@ NEIGHBOR_FALLOFF = np.exp(-0.5 / PIXEL_SIGMA_PX**2 * np.array([2, 1, 2, 1, 0, 1,
 
 
 def layered_gaussians(
-    inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = TILE_LEVELS
+    inverse_depth: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    levels: int = TILE_LEVELS,
+    *,
+    unmix: bool = True,
 ) -> Gaussians:
     """Gaussians, about one and at most 2.25 per pixel, that blend to the photo at its camera.
 
@@ -66,6 +71,8 @@ def layered_gaussians(
         camera: the photo's camera.
         levels: number of tile sizes, from 2×2 pixels on. All pixels of a tile share one Gaussian;
             with 0, every pixel has its own.
+        unmix: whether pixels beside a depth step may show two surfaces, whose colours are
+            separated; else each shows one.
 
     Returns:
         In this order: single pixels, row by row, on the surface that covers most of the pixel;
@@ -73,7 +80,10 @@ def layered_gaussians(
     """
     slope = inverse_depth_slope(inverse_depth)  # [H, W, 2]
     layers = find_layers(
-        inverse_depth.contiguous().numpy(), slope.contiguous().numpy(), colors.contiguous().numpy()
+        inverse_depth.contiguous().numpy(),
+        slope.contiguous().numpy(),
+        colors.contiguous().numpy(),
+        unmix=unmix,
     )
     ring = torch.from_numpy(layers.ring)  # [H, W] distance to the nearest depth step, or 0
 
