@@ -174,8 +174,7 @@ class GuessedPhotos:
         for index, photo in enumerate(self.photos):
             if not self._file(index).is_file():
                 try:
-                    outputs = base.at_scales(load_photo(photo).rgb, looks)
-                    guess = sure_inverse_depth(_of_one_size(outputs))
+                    guess = sure_inverse_depth(base.at_scales(load_photo(photo).rgb, looks))
                 except (InputError, ValueError) as error:
                     warn(f"passed over: {error}")
                     continue
@@ -205,14 +204,6 @@ class GuessedPhotos:
 
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:05d}.safetensors"
-
-
-def _of_one_size(outputs: Sequence[Tensor]) -> Tensor:
-    """[n, h, w] of n maps, resized to the size of the last map, which is the finest."""
-    size = outputs[-1].shape
-    return torch.cat(
-        [interpolate(output[None, None], size=size, mode="bilinear")[0] for output in outputs]
-    )
 
 
 def sure_inverse_depth(looks: Tensor) -> Tensor:

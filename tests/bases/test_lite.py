@@ -21,7 +21,6 @@ from spackle.bases.lite import (
     LiteBase,
     LiteNet,
     load_networks,
-    merge_outputs,
 )
 from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
@@ -55,36 +54,6 @@ def test_depth_of_a_real_photo_beats_a_ramp_and_a_plane() -> None:
     for guess in (vertical_ramp(*depth.shape), torch.ones_like(depth)):
         assert found.abs_rel < 0.9 * score_depth(guess, depth, valid).abs_rel
     assert found.delta > 0.8
-
-
-def box_at(height: int, width: int) -> torch.Tensor:
-    """[height, width] of a box before a wall as a map of this size shows it; 64×96 is sharp."""
-    box = torch.zeros(64, 96)
-    box[20:45, 30:71] = 1.0
-    return interpolate(box[None, None], size=(height, width), mode="area")[0, 0]
-
-
-@pytest.mark.parametrize("upright", [False, True])
-def test_maps_of_all_sizes_merge_into_outlines_as_sharp_as_the_finest_map_has(
-    upright: bool,
-) -> None:
-    maps = [box_at(8, 12), box_at(16, 24), box_at(32, 48), box_at(32, 48), box_at(64, 96)]
-    if upright:
-        maps = [one.T for one in maps]
-    merged = merge_outputs(maps, [True] * 5)
-    torch.testing.assert_close(merged, maps[-1], atol=1e-5, rtol=0)
-
-
-def test_maps_of_one_size_merge_into_their_mean() -> None:
-    noise = torch.randn(32, 48, generator=torch.Generator().manual_seed(0))
-    merged = merge_outputs([box_at(32, 48) + noise, box_at(32, 48) - noise], [True, True])
-    torch.testing.assert_close(merged, box_at(32, 48), atol=1e-5, rtol=0)
-
-
-def test_a_map_without_low_frequencies_does_not_tilt_the_merged_map() -> None:
-    tilt = torch.linspace(-3, 3, 96).expand(64, 96)
-    merged = merge_outputs([box_at(32, 48), box_at(64, 96) + tilt], [True, False])
-    assert abs(float(merged[:, :16].mean() - merged[:, -16:].mean())) < 0.6  # of the tilt's 5
 
 
 def test_the_same_photo_gives_the_same_scene_and_its_colours() -> None:

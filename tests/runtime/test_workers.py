@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from spackle.runtime import loaded_kernels
 from spackle.runtime.worker_options import WorkerOptions
 from spackle.runtime.workers import parallel_map
 
@@ -61,3 +62,9 @@ def test_a_user_who_says_nothing_gets_a_process_for_each_gpu(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert WorkerOptions.of_command(count, None, device, ray, job_count=3).count == expected
+
+
+def test_numba_is_whole_before_processes_are_forked() -> None:
+    """A kernel was compiled or loaded when the module was imported, so numba is loaded."""
+    assert loaded_kernels._same.signatures
+    assert loaded_kernels._same(3) == 3

@@ -330,7 +330,7 @@ class InputScale:
 
 
 # Both networks were trained at up to 256×320. Small inputs show whole objects at once, large inputs
-# show outlines: the merged output has a smaller error than the best single output. Mirroring the
+# show outlines: the mean output has a smaller error than the best single output. Mirroring the
 # largest input costs most and gains nothing.
 INPUT_SCALES = (
     InputScale(64 * 96),
@@ -420,14 +420,18 @@ class LiteBase:
         return merge_outputs(log_inverse_depths, gives_low_frequencies).exp()
 
     @torch.no_grad()
-    def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> list[Tensor]:
-        """Maps [h, w] of log inverse depth of a photo [H, W, 3], one for each of n input scales.
+    def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
+        """[n, h, w] log inverse depth of a photo [H, W, 3], one map for each of n input scales.
 
-        Each map has half the size of its network's input, is known only up to a constant of its
-        own, and is on the CPU.
+        All maps are resized to the size of the last scale's map, which is the finest, and are on
+        the CPU. Each is known only up to a constant of its own.
         """
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)  # [1, 3, H, W]
-        return [self._run_network(picture, scale).cpu() for scale in scales]
+        # Each output is [1, 1, its height, its width], as `interpolate` needs it.
+        outputs = [self._run_network(picture, scale)[None, None] for scale in scales]
+        finest_size = outputs[-1].shape[2:]
+        resized = [interpolate(output, size=finest_size, mode="bilinear")[0] for output in outputs]
+        return torch.cat(resized).cpu()
 
     def _run_network(self, picture: Tensor, scale: InputScale) -> Tensor:
         """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], resized to (h, w) for the network.
@@ -448,52 +452,24 @@ class LiteBase:
         return torch.stack([outputs[0], outputs[1].flip(-1)]).mean(0)
 
 
-def merge_outputs(outputs: Sequence[Tensor], gives_low_frequencies: Sequence[bool]) -> Tensor:
-    """[h, w] log inverse depth, merged from n maps of different sizes for the same photo.
+def merge_outputs(outputs: Tensor, gives_low_frequencies: Sequence[bool]) -> Tensor:
+    """Mean [h, w] of n maps of log inverse depth [n, h, w] for the same photo.
 
-    The result has the size of the finest map, and is a sum of bands of spatial frequencies. The
-    lowest are means in 3×4 cells, averaged over the maps for which `gives_low_frequencies` (n
-    values) is true. Each further band is what a map gains from the size of one map to that of the
-    next finer one; it is averaged over the maps that have at least this finer size.
+    Each map is split into its low frequencies (its means in 3×4 cells, interpolated) and the rest,
+    its outlines. The mean outlines of all maps are added to the mean low frequencies of those maps
+    for which `gives_low_frequencies` (n values) is true.
     """
-    # Averaging whole maps would make a ramp of each jump: only the finest map has details of its
-    # own size, and its outlines would be divided by n.
-    sizes = sorted({_size(output) for output in outputs})  # from coarse to fine
-    finest_size = sizes[-1]
     # A network's output for a large input has sharp outlines, but wrong slopes over the whole
-    # picture. Four cells lie along the longer side.
-    cells = COARSE_CELLS if finest_size[0] <= finest_size[1] else COARSE_CELLS[::-1]
-    coarse = [
-        _resized(_resized(_resized(output, finest_size), cells, "area"), finest_size, "bicubic")
-        for output in outputs
-    ]
-    contributing = [low for low, gives in zip(coarse, gives_low_frequencies, strict=True) if gives]
-    merged = torch.stack(contributing).mean(0)
-
-    for size in sizes:
-        bands = []
-        for index, output in enumerate(outputs):
-            if _size(output) < size:
-                continue  # this map has no such details
-            # The map as it would be at this size; for its own size that is the map itself.
-            reduced = _resized(output, size, "area")
-            fine = _resized(reduced, finest_size)
-            bands.append(fine - coarse[index])
-            coarse[index] = fine
-        merged = merged + torch.stack(bands).mean(0)
+    # picture: only its outlines are of use.
+    height, width = outputs.shape[1:]
+    # Four cells lie along the longer side.
+    cells = COARSE_CELLS if height <= width else COARSE_CELLS[::-1]
+    cell_means = interpolate(outputs[None], size=cells, mode="area")
+    low_frequencies = interpolate(cell_means, size=(height, width), mode="bicubic")[0]
+    outlines = outputs - low_frequencies
+    contributing = low_frequencies[torch.tensor(gives_low_frequencies)]  # [≤ n, h, w]
+    merged: Tensor = outlines.mean(0) + contributing.mean(0)
     return merged
-
-
-def _size(values: Tensor) -> tuple[int, int]:
-    """(height, width) of a map."""
-    height, width = values.shape
-    return height, width
-
-
-def _resized(values: Tensor, size: tuple[int, int], mode: str = "bilinear") -> Tensor:
-    """[h, w] of `size`, resized from a map [H, W] by a mode of torch's `interpolate`."""
-    resized: Tensor = interpolate(values[None, None], size=size, mode=mode)[0, 0]
-    return resized
 
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
