@@ -12,6 +12,7 @@ from typing import Any, Literal
 import pytest
 
 import spackle
+from spackle.bases import DEFAULT_MAX_DISPARITY, lite
 from spackle.cli import options as cli_options
 from spackle.cli.predict import predict as predict_command
 from spackle.runtime.declared_options import DECLARATIONS
@@ -218,3 +219,12 @@ def test_help_does_not_wait_for_torch() -> None:
     source = Path(inspect.getfile(type(next(iter(DECLARATIONS.values()))))).read_text()
     imports = [line for line in source.splitlines() if line.startswith(("import", "from"))]
     assert not [line for line in imports if "torch" in line or "spackle" in line]
+
+
+def test_the_texts_name_the_limits_of_the_movement() -> None:
+    with_lite, otherwise = f"{lite.MAX_DISPARITY:g}", f"{DEFAULT_MAX_DISPARITY:g}"
+    unset = DECLARATIONS["disparity"].unset
+    assert unset is not None
+    assert f"at most {with_lite} with lite, else {otherwise}" in unset
+    documentation = " ".join((inspect.getdoc(spackle.predict) or "").split())
+    assert f"limit of {with_lite} for lite and {otherwise} for other bases" in documentation

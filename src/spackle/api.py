@@ -210,7 +210,7 @@ def predict(
             rightmost views.
         disparity: size of the camera's movement, see
             `spackle.core.trajectories.disparity_to_offset`; None chooses it for the photo, with a
-            limit of 0.15 for lite and 0.3 for other bases.
+            limit of 0.1 for lite and 0.3 for other bases.
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
         depth_unit: the unit of metric depth, such as "mm", "1/256" or 0.001.
         residual: the network that fills holes, see `Spackle`.

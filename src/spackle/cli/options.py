@@ -181,7 +181,7 @@ DisparityOption = Annotated[
     float | None,
     declared(
         "disparity",
-        unset="the saved scene's; predict: chosen for the photo, at most 0.15 with lite, else 0.3",
+        unset=f"the saved scene's; predict: {DECLARATIONS['disparity'].unset}",
     ),
 ]
 PathFileOption = Annotated[Path | None, declared("path", "--path", metavar="FILE", hidden=True)]

@@ -142,7 +142,7 @@ class DeclaredOptions:
     disparity: float | None = _option(
         None,
         "How far the camera moves to the side, as a disparity from 0 to 2; 0.3 is large.",
-        "chosen for the photo, at most 0.15 with lite, else 0.3",
+        "chosen for the photo, at most 0.1 with lite, else 0.3",
         ge=0,
         le=MAX_DISPARITY,
     )

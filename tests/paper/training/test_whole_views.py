@@ -225,6 +225,7 @@ def test_all_cells_get_gaussians_in_training_but_only_masked_ones_are_validated(
 
 
 @needs_posix_signals
+@pytest.mark.slow  # test_training.py does the same with crops
 def test_a_killed_run_resumes_with_the_same_result(place: Path, tmp_path: Path) -> None:
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert train(place, whole).code == 0
@@ -237,6 +238,7 @@ def test_a_killed_run_resumes_with_the_same_result(place: Path, tmp_path: Path) 
     assert (out / "best.safetensors").read_bytes() == (whole / "best.safetensors").read_bytes()
 
 
+@pytest.mark.slow  # test_training.py does the same with crops
 def test_two_processes_give_the_result_of_one(place: Path, tmp_path: Path) -> None:
     # Each process accumulates two views of different sizes and holes at each step.
     options = ["optim.steps=3", "optim.batch=4", "run.validate_every=3"]
