@@ -258,7 +258,8 @@ class Scene:
         framing = None
         is_before_camera = bool((self.base.means[:, 2] > 0).any())
         if self.disparity is not None and viewed_as is None and is_before_camera:
-            framing = PathOptions().choose_framing(
+            # Of all paths a swipe shows most of what lies beyond the border, as a drag does.
+            framing = PathOptions(trajectory="swipe").choose_framing(
                 self.base, self.camera, self.depth_range, self.disparity, get_renderer()
             )
         return page_scene(

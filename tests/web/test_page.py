@@ -61,10 +61,12 @@ def page_of_box(name: str = "Box") -> PageScene:
     return page_scene(name, box().base, box().aux, box().camera, 0.35, is_metric=box().is_metric)
 
 
-def test_the_page_looks_where_the_video_looks() -> None:
+def test_the_page_looks_where_the_video_of_a_swipe_looks() -> None:
     scene = dataclasses.replace(box(), disparity=0.35)
     usual = scene.depth_range.focus
-    framing = PathOptions().choose_framing(scene.base, scene.camera, scene.depth_range, 0.35, CPU)
+    framing = PathOptions(trajectory="swipe").choose_framing(
+        scene.base, scene.camera, scene.depth_range, 0.35, CPU
+    )
     assert framing.focus > usual  # else the test would show nothing
     page = scene.page("Box").description
     assert page["focus"] == framing.focus
