@@ -38,6 +38,11 @@ class RoomView:
         """The view's name in messages."""
         return f"{self.archive} {self.key}.{self.number:02d}"
 
+    @property
+    def identity(self) -> tuple[str, str, int]:
+        """What the digest of a run's data says of the view."""
+        return self.archive.name, self.key, self.number
+
     def read(self) -> Frame:
         """Read the view; the photo as a camera made it. InputError if the archive is damaged."""
         name = f"{self.key}.{self.number:02d}"
@@ -87,7 +92,7 @@ class JudgedRoom:
     @property
     def identity(self) -> tuple[str | int, ...]:
         """What the digest of a run's data says of the photo."""
-        return self.view.archive.name, self.view.key, self.view.number
+        return self.view.identity
 
     def read(self, side: int) -> Frame:
         """Read the photo, whose longer side has less than `side` pixels; the sky counts as unknown,

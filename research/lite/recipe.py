@@ -228,7 +228,7 @@ class LiteFiles:
             _names(files)
             for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))
         ]
-        rooms = [(view.archive.name, view.key, view.number) for view in self.worlds]
+        rooms = [view.identity for view in self.worlds]
         return short_digest((self.scenes_digest, self.guesses_digest, facts, names, rooms))
 
 

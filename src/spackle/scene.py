@@ -25,7 +25,13 @@ from spackle.core.trajectories import (
     TrajectoryKind,
     trajectory_cameras,
 )
-from spackle.formats.html import PREVIEW_SIDE_PX, PageScene, page_scene, single_html
+from spackle.formats.html import (
+    PREVIEW_SIDE_PX,
+    PageScene,
+    check_has_front,
+    page_scene,
+    single_html,
+)
 from spackle.formats.scene_content import SceneFile, is_at_origin
 from spackle.formats.scene_files import encoder_for, load_scene
 from spackle.render import Renderer, get_renderer
@@ -253,11 +259,11 @@ class Scene:
         `name` is the title on the page, `note` a line for the user below it; `viewed_as` is the
         description of a former state of the scene, whose lens and paths the page keeps.
         """
+        check_has_front(name, self.base)
         # Only a completed photo has a border beyond which things are made up. An edited scene keeps
-        # the framing that it has, and a scene behind the camera is refused by `page_scene`.
+        # the framing that it has.
         framing = None
-        is_before_camera = bool((self.base.means[:, 2] > 0).any())
-        if self.disparity is not None and viewed_as is None and is_before_camera:
+        if self.disparity is not None and viewed_as is None:
             # Of all paths a swipe shows most of what lies beyond the border, as a drag does.
             framing = PathOptions(trajectory="swipe").choose_framing(
                 self.base, self.camera, self.depth_range, self.disparity, get_renderer()

@@ -34,6 +34,7 @@ from spackle.formats import load_ply
 from spackle.formats.html import PageScene, page_scene, read_page_file, single_html
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
+from spackle.runtime.errors import InputError
 from spackle.scene import Scene
 from spackle.views import PathOptions
 from spackle.web.guard import MAX_UPLOAD_BYTES
@@ -77,6 +78,17 @@ def test_the_page_looks_where_the_video_of_a_swipe_looks() -> None:
     former = {**page, "focus": 1.25}
     assert scene.page("Box", viewed_as=former).description["focus"] == 1.25
     assert box().page("Box").description["focus"] == usual
+
+
+@pytest.mark.parametrize("disparity", [None, 0.35])
+def test_a_scene_behind_the_camera_is_refused_by_its_name(disparity: float | None) -> None:
+    means = box().base.means * torch.tensor([1.0, 1.0, -1.0])
+    base = dataclasses.replace(box().base, means=means)
+    behind = dataclasses.replace(box(), base=base, disparity=disparity)
+    with pytest.raises(
+        InputError, match=r"^Box: no Gaussian lies in front .* shown$"
+    ):
+        behind.page("Box")
 
 
 def test_the_built_page_belongs_to_its_sources() -> None:

@@ -114,6 +114,13 @@ class PageScene:
         return view.resized(*size)
 
 
+def check_has_front(name: str, base: Gaussians) -> None:
+    """InputError, which begins with the scene's `name`, if nothing lies before its camera."""
+    if not bool((base.means[:, 2] > 0).any()):
+        problem = "no Gaussian lies in front of the photo's camera"
+        raise InputError(f"{name}: {problem}: nothing can be shown")
+
+
 def page_scene(
     name: str,
     base: Gaussians,
@@ -151,9 +158,7 @@ def page_scene(
     Raises:
         InputError: no Gaussian lies in front of the camera.
     """
-    if not bool((base.means[:, 2] > 0).any()):
-        problem = "no Gaussian lies in front of the photo's camera"
-        raise InputError(f"{name}: {problem}: nothing can be shown")
+    check_has_front(name, base)
 
     # The page computes in half and single floats, which suit metres: a scene in another unit is
     # shown in a similar one. Its paths are multiples of its own depths, and so stay the same.

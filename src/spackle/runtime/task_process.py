@@ -162,10 +162,8 @@ class TaskProcess:
         """
         context = process_context()
         self._pipe, worker_pipe = context.Pipe()
-        # The server that is forked may have been started in another environment.
-        environment = dict(os.environ)
         self._process = context.Process(
-            target=_serve, args=(worker_pipe, work, gpu_number, environment), daemon=True
+            target=_serve, args=(worker_pipe, work, gpu_number, dict(os.environ)), daemon=True
         )
         try:
             self._process.start()
@@ -242,12 +240,9 @@ def _serve(
     """Run in the worker process: do the tasks that come through the pipe until it closes.
 
     After each task, None is sent, or a `TaskFailure`. The number of the GPU is that of
-    `TaskProcess`; `environment` replaces the variables of this process.
+    `TaskProcess`; `environment` is that of the parent.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    os.environ.clear()
-    os.environ.update(environment)
+    become_child(environment)
     if gpu_number is not None:
         from spackle.runtime.device import use_gpu  # only here, because it loads torch
 
@@ -322,7 +317,20 @@ def _limited(limits: TaskLimits) -> Iterator[None]:
             resource.setrlimit(kind, former[kind])
 
 
-def end_with_parent() -> None:
+def become_child(environment: Mapping[str, str]) -> None:
+    """Set up a process that has just started: its parent decides what Ctrl-C ends, and it ends
+    with its parent.
+
+    `environment` replaces the variables of this process. They are those of the server that it was
+    forked from, which may have been started in another environment.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    os.environ.clear()
+    os.environ.update(environment)
+
+
+def _end_with_parent() -> None:
     """Wait until the parent process has ended, then end this process at once.
 
     Without a thread that does this, a worker whose parent was killed would run for ever.

@@ -6,8 +6,6 @@ import contextlib
 import functools
 import itertools
 import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -18,7 +16,7 @@ import torch
 
 from spackle.runtime.device import use_gpu
 from spackle.runtime.errors import InputError
-from spackle.runtime.task_process import end_with_parent, import_ahead, process_context
+from spackle.runtime.task_process import become_child, import_ahead, process_context
 from spackle.runtime.worker_options import WorkerOptions
 
 # A process always has its next job at hand; more jobs would keep more results in memory.
@@ -86,7 +84,6 @@ def parallel_map(
         process_count,
         context,
         initializer=_start_process,
-        # The process that is forked may have been started in another environment.
         initargs=(workers.threads, open_worker, gpu_numbers, dict(os.environ)),
     )
     try:
@@ -153,15 +150,12 @@ def _start_process(
         threads: torch's threads.
         open_worker: makes the object that does the jobs.
         gpu_numbers: a queue that holds one number, or None for no GPU, for each process.
-        environment: replaces the variables of this process.
+        environment: that of the main process.
     """
     # The worker is made at the first job, because only jobs can report errors to the main process.
     global _get_worker
     _get_worker = functools.cache(open_worker)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process decides what Ctrl-C ends
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    os.environ.clear()
-    os.environ.update(environment)
+    become_child(environment)
     torch.set_num_threads(threads)
 
     use_gpu(gpu_numbers.get())

@@ -242,7 +242,7 @@ class Jobs:
         self._work = work
         self.work_times = {"done": WorkTimes(), "failed": WorkTimes()}
 
-        import_ahead("spackle.web.preloaded")
+        import_ahead("spackle.web.work")
         # A process that makes scenes keeps the network that it has loaded. A single one, and those
         # of the other lanes, use torch's default GPU.
         gpu_numbers = range(workers) if workers > 1 else range(0)

@@ -23,6 +23,7 @@ from fastapi import FastAPI
 from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.core.photo import check_photo_size, load_photo
+from spackle.formats.html import check_has_front
 from spackle.formats.scene_files import is_scene_folder, load_scene, scene_suffix
 from spackle.results.saved_scene import log_losses, page_name
 from spackle.runtime.errors import InputError, as_input_error
@@ -164,7 +165,7 @@ def _check_target(target: Path, options: ViewOptions, reporter: Reporter) -> str
         ):
             loaded = load_scene(target)
             scene = Scene.of_file(loaded, focal_px=options.focal_px, fov=options.fov)
-            scene.page(target.name)  # fails if the page cannot show the scene
+            check_has_front(target.name, scene.base)
         log_losses(loaded, reporter)
         return page_name(target)
 
