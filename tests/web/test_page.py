@@ -85,9 +85,7 @@ def test_a_scene_behind_the_camera_is_refused_by_its_name(disparity: float | Non
     means = box().base.means * torch.tensor([1.0, 1.0, -1.0])
     base = dataclasses.replace(box().base, means=means)
     behind = dataclasses.replace(box(), base=base, disparity=disparity)
-    with pytest.raises(
-        InputError, match=r"^Box: no Gaussian lies in front .* shown$"
-    ):
+    with pytest.raises(InputError, match=r"^Box: no Gaussian lies in front .* shown$"):
         behind.page("Box")
 
 
