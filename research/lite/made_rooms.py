@@ -1,4 +1,4 @@
-"""Furnished rooms of `research/worlds` as a source of frames.
+"""Furnished rooms, streets and gardens of `research/worlds` as a source of frames.
 
 The archives are described in research/worlds/shards.py; reading them needs nothing of that folder.
 """
@@ -21,7 +21,9 @@ from spackle.paper.dataset.encoding import decode_depth, decode_png
 from spackle.paper.training.measured_photos import find_files
 from spackle.runtime.errors import as_input_error
 
-ARCHIVES = ("worlds-",)  # how the names of archives begin
+# How the names of archives begin: rooms and streets. Those of tracks, `tracks-`, are passed over,
+# because the terms of their models ask that what is made of them is shared alike.
+ARCHIVES = ("worlds-", "streets-")
 SURFACE, SKY = 1, 2  # values of the validity picture; 0: seen through glass
 
 

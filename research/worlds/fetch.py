@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from spackle.runtime.errors import InputError
@@ -35,17 +36,24 @@ def fetch(folder: Path) -> None:
         InputError: apt-get or dpkg is missing or fails.
     """
     root = folder / "root"
-    if (root / CATALOGUES).is_dir():
-        return
-    archives = folder / "debs"
+    if not (root / CATALOGUES).is_dir():
+        download(PACKAGES, folder / "debs", root)
+
+
+def download(packages: Sequence[str], archives: Path, root: Path) -> None:
+    """Download Debian's packages into a folder of archives, and unpack them into another folder.
+
+    Raises:
+        InputError: apt-get or dpkg is missing or fails.
+    """
     archives.mkdir(parents=True, exist_ok=True)
     try:
-        subprocess.run(["apt-get", "download", *PACKAGES], cwd=archives, check=True)
+        subprocess.run(["apt-get", "download", *packages], cwd=archives, check=True)
         for archive in sorted(archives.glob("*.deb")):
             subprocess.run(["dpkg", "-x", str(archive), str(root)], check=True)
     except (OSError, subprocess.CalledProcessError) as error:
         raise InputError(
-            f"{folder}: cannot fetch {' and '.join(PACKAGES)} ({error}): needs Debian or Ubuntu; "
+            f"{archives}: cannot fetch {' and '.join(packages)} ({error}): needs Debian or Ubuntu; "
             "run `apt-get update` first"
         ) from error
 

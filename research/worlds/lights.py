@@ -31,6 +31,8 @@ class Lights:
     lamp_radii: Floats  # [L] metres
     lamp_colors: Floats  # [L, 3] irradiance at one metre
     ambient: float = 0.0  # radiance that comes from everywhere; stands for what is not built
+    haze_m: float = math.inf  # distance after which haze has replaced 63 % of a surface's light
+    haze_color: Floats = dataclasses.field(default_factory=lambda: np.zeros(3, np.float32))  # [3]
 
     def sky_radiance(self, directions: Floats) -> Floats:
         """[N, 3] the sky's radiance from unit directions [N, 3], by the nearest pixel."""

@@ -1,6 +1,10 @@
-"""Make worlds: furnished rooms as photos with depth, and six more views of each.
+"""Make worlds: rooms, streets or tracks as photos with depth, and six more views of each.
 
     PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 1000 --photos PHOTOS
+    PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 500 --kind streets
+
+Archives of streets and gardens are called `streets-`, those of tracks `tracks-`. Tracks are from
+the second set of models, whose terms are not those of the first; see README.md.
 
 A world depends on the seed and its number alone. The command goes on where it was stopped; archives
 that are there are kept. Two processes share the work by `--part 1/2` and `--part 2/2`.
@@ -11,8 +15,9 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,19 +30,37 @@ from spackle.runtime.folders import file_lock, make_folder
 from worlds.caster import World
 from worlds.fetch import cache_folder, open_library
 from worlds.furniture import Furniture
+from worlds.library import Library
 from worlds.photo_camera import choose_development, photographed
 from worlds.photo_camera import developed as develop
-from worlds.rooms import DrawPhoto, furnish
-from worlds.shards import WORLDS_PER_SHARD, pack_world, shard_file, write_shard
-from worlds.viewpoints import choose_viewpoint, pixel_grid, second_cameras
-from worlds.views import VALID, render
+from worlds.plans import OpenPlan
+from worlds.rooms import DrawPhoto, WorldPlan, furnish
+from worlds.shards import ROOMS_PREFIX, WORLDS_PER_SHARD, pack_world, shard_file, write_shard
+from worlds.streets import street_or_garden
+from worlds.torcs import open_torcs
+from worlds.tracks import track
+from worlds.viewpoints import (
+    CANDIDATES,
+    Viewpoint,
+    best_viewpoint,
+    choose_viewpoint,
+    pixel_grid,
+    second_cameras,
+)
+from worlds.views import COARSE_M, VALID, render
 
 Rng = np.random.Generator
 SIZE = (336, 448)  # height and width of pictures
 UPRIGHT = 0.25  # share of worlds whose photo is upright
 ATTEMPTS = 20  # rooms that may show too little, one after another
 MIN_KNOWN = 0.6  # share of a photo with a known surface
-VERSION = 2  # increases whenever the same seed gives other worlds
+OPEN_MIN_KNOWN = 0.5  # in the open, where the sky is not a surface
+OPEN_NEAR_M = 0.8  # nearer things in the open fill the picture
+VERSION = 2  # increases whenever the same seed gives other rooms
+OPEN_VERSION = 1  # and other streets, gardens and tracks
+# How the names of archives begin, by the kind of worlds in them.
+PREFIXES = {"rooms": ROOMS_PREFIX, "streets": "streets", "tracks": "tracks"}
+DrawPlan = Callable[[Rng], OpenPlan]
 
 
 def photos_of(folder: Path | None) -> DrawPhoto | None:
@@ -88,28 +111,101 @@ def make_world(
         viewpoint = choose_viewpoint(rng, plan.place, world, height, width)
         if viewpoint is None:
             continue
-        hits = world.first_hits(*viewpoint.rays(viewpoint.camera, pixel_grid(height, width)))
-        known = hits.triangle >= 0
-        if known.mean() < MIN_KNOWN:
-            continue
-        cameras, names = second_cameras(rng, world, viewpoint, hits.distance[known])
-        views = render(rng, world, plan.lights, viewpoint, [viewpoint.camera, *cameras])
-        if (views[0].valid == VALID).mean() < MIN_KNOWN:
-            continue
-        settings = choose_development(rng, views[0].radiance)
-        jpeg = photographed(rng, develop(views[0].radiance, settings), settings)
-        facts = {
-            "version": VERSION,
-            "seed": seed,
-            "number": number,
-            "kind": plan.kind,
-            "models": list(plan.models),
-            "triangles": plan.mesh.count,
-            "trajectories": names,
-        }
-        key = f"{seed:02d}-{number:06d}"
-        return pack_world(key, jpeg, views, settings, facts), len(views)
+        made = _packed(rng, world, viewpoint, plan, seed, number, MIN_KNOWN, COARSE_M)
+        if made is not None:
+            return made
     raise InputError(f"world {number}: {ATTEMPTS} rooms in a row show too little")
+
+
+def make_open_world(
+    draw: DrawPlan,
+    library: Library,
+    seed: int,
+    number: int,
+    size: tuple[int, int] = SIZE,
+) -> tuple[bytes, int]:
+    """A packed street, garden or track, and its number of views.
+
+    Args:
+        draw: gives a random one.
+        library: its models, of which the JSON names creators and licences.
+        seed, number: determine the world.
+        size: height and width, swapped in upright photos.
+
+    Raises:
+        InputError: no place in a row of `ATTEMPTS` shows enough.
+    """
+    entries = {model.entry.key: model.entry for model in library.models}
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([OPEN_VERSION, seed, number, attempt])
+        height, width = size if rng.random() >= UPRIGHT else size[::-1]
+        plan = draw(rng)
+        world = World(plan.mesh, plan.pictures)
+        candidates = [plan.draw_viewpoint(rng, height, width) for _ in range(CANDIDATES)]
+        viewpoint = best_viewpoint(world, candidates, OPEN_NEAR_M)
+        if viewpoint is None:
+            continue
+        # Who asks for attribution, and under which terms.
+        used = [entries[key] for key in plan.models]
+        facts = {
+            "version": OPEN_VERSION,
+            "creators": sorted({one.creator for one in used if one.creator}),
+            "licences": sorted({one.licence for one in used}),
+        }
+        made = _packed(
+            rng, world, viewpoint, plan, seed, number, OPEN_MIN_KNOWN, plan.coarse_m, facts
+        )
+        if made is not None:
+            return made
+    raise InputError(f"world {number}: {ATTEMPTS} places in a row show too little")
+
+
+def _packed(
+    rng: Rng,
+    world: World,
+    viewpoint: Viewpoint,
+    plan: WorldPlan | OpenPlan,
+    seed: int,
+    number: int,
+    min_known: float,
+    coarse_m: float,
+    more_facts: Mapping[str, Any] | None = None,
+) -> tuple[bytes, int] | None:
+    """A packed world and its number of views; None if its photo shows too few surfaces.
+
+    Args:
+        rng: for second cameras, rays and the photo's settings.
+        world: the plan's triangles.
+        viewpoint: the photo's camera.
+        plan: what the world consists of.
+        seed, number: of the world; its key.
+        min_known: share of the photo with a known surface.
+        coarse_m: width of the coarse cells of light in metres.
+        more_facts: what else its JSON says.
+    """
+    camera = viewpoint.camera
+    pixels = pixel_grid(camera.height, camera.width)
+    hits = world.first_hits(*viewpoint.rays(camera, pixels))
+    known = hits.triangle >= 0
+    if known.mean() < min_known:
+        return None
+    cameras, names = second_cameras(rng, world, viewpoint, hits.distance[known])
+    views = render(rng, world, plan.lights, viewpoint, [camera, *cameras], coarse_m)
+    if (views[0].valid == VALID).mean() < min_known:
+        return None
+    settings = choose_development(rng, views[0].radiance)
+    jpeg = photographed(rng, develop(views[0].radiance, settings), settings)
+    facts = {
+        "version": VERSION,
+        "seed": seed,
+        "number": number,
+        "kind": plan.kind,
+        "models": list(plan.models),
+        "triangles": plan.mesh.count,
+        "trajectories": names,
+    } | dict(more_facts or {})
+    key = f"{seed:02d}-{number:06d}"
+    return pack_world(key, jpeg, views, settings, facts), len(views)
 
 
 def make_shards(
@@ -118,6 +214,7 @@ def make_shards(
     worlds: int,
     part: tuple[int, int],
     log: Callable[[str], None],
+    prefix: str = ROOMS_PREFIX,
 ) -> None:
     """Write all archives that are missing.
 
@@ -127,11 +224,12 @@ def make_shards(
         worlds: how many there shall be.
         part: this process's part, from 0, and the number of parts.
         log: called with a line for each archive.
+        prefix: how the archives' names begin.
     """
     make_folder(output)
     shards = -(-worlds // WORLDS_PER_SHARD)
     for shard in range(part[0], shards, part[1]):
-        path = shard_file(output, shard)
+        path = shard_file(output, shard, prefix)
         if path.is_file():
             continue
         begin = time.perf_counter()
@@ -149,12 +247,36 @@ def make_shards(
         )
 
 
+def _maker(
+    kind: str, cache: Path, photo: DrawPhoto | None, seed: int
+) -> Callable[[int], tuple[bytes, int]]:
+    """What makes the packed world of a number, and its number of views.
+
+    Args:
+        kind: a key of `PREFIXES`.
+        cache: where models and surfaces are kept.
+        photo: gives photos for rooms, or None.
+        seed: determines the worlds, with their numbers.
+    """
+    if kind == "rooms":
+        furniture = Furniture(open_library(cache))
+        return lambda number: make_world(furniture, cache, photo, seed, number)
+    library = open_torcs(cache) if kind == "tracks" else open_library(cache)
+
+    def draw(rng: Rng) -> OpenPlan:
+        """A random place."""
+        return track(rng, library) if kind == "tracks" else street_or_garden(rng, library, cache)
+
+    return lambda number: make_open_world(draw, library, seed, number)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder for archives")
+    parser.add_argument("--kind", choices=sorted(PREFIXES), default="rooms")
     parser.add_argument("--worlds", type=int, default=48, help="how many there shall be")
     parser.add_argument("--photos", type=Path, help="photos for frames and windows")
     parser.add_argument("--seed", type=int, default=0)
@@ -163,14 +285,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         which, parts = (int(word) for word in options.part.split("/"))
-        photo = photos_of(options.photos)
         cache = cache_folder(options.cache)
-        furniture = Furniture(open_library(options.cache))
-
-        def make(number: int) -> tuple[bytes, int]:
-            """The world with this number."""
-            return make_world(furniture, cache, photo, options.seed, number)
-
+        make = _maker(options.kind, cache, photos_of(options.photos), options.seed)
         make_folder(options.output)
         with file_lock(options.output / f".part-{which}.lock"):
             make_shards(
@@ -179,6 +295,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 options.worlds,
                 (which - 1, parts),
                 lambda line: print(line, flush=True),
+                PREFIXES[options.kind],
             )
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -253,3 +253,77 @@ def box(
             quad((x0, y1, z0), dx, back_y, material, tile_m),  # bottom
         ]
     )
+
+
+class Faces:
+    """Many parallelograms and boxes, which become one mesh at once; see `quad` and `box`."""
+
+    def __init__(self) -> None:
+        """None yet."""
+        # By material: corner, two sides, width and height of a repeat, texture offset.
+        self._rows: dict[Material, list[tuple[float, ...]]] = {}
+
+    def quad(
+        self,
+        origin: Sequence[float],
+        side: Sequence[float],
+        other: Sequence[float],
+        material: Material,
+        tile_m: float | None = None,
+        uv_offset: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Add a parallelogram as `quad` makes it; `tile_m` is both sides of a repeat."""
+        size = 0.0 if tile_m is None else tile_m
+        row = (*origin, *side, *other, size, *uv_offset)
+        self._rows.setdefault(material, []).append(row)
+
+    def box(
+        self,
+        low: Sequence[float],
+        high: Sequence[float],
+        material: Material,
+        tile_m: float | None = None,
+    ) -> None:
+        """Add a box as `box` makes it."""
+        x0, y0, z0 = low
+        x1, y1, z1 = high
+        x, y, z = x1 - x0, y1 - y0, z1 - z0
+        size = 0.0 if tile_m is None else tile_m
+        self._rows.setdefault(material, []).extend(
+            (
+                (x0, y0, z0, x, 0, 0, 0, 0, z, size, 0, 0),  # front
+                (x1, y1, z0, -x, 0, 0, 0, 0, z, size, 0, 0),  # back
+                (x0, y1, z0, 0, -y, 0, 0, 0, z, size, 0, 0),  # left
+                (x1, y0, z0, 0, y, 0, 0, 0, z, size, 0, 0),  # right
+                (x0, y0, z1, x, 0, 0, 0, y, 0, size, 0, 0),  # top
+                (x0, y1, z0, x, 0, 0, 0, -y, 0, size, 0, 0),  # bottom
+            )
+        )
+
+    def mesh(self) -> Mesh:
+        """All of them as one mesh; ValueError if there are none."""
+        parts = [_parallelograms(np.array(rows), one) for one, rows in self._rows.items()]
+        return joined(parts)
+
+
+def _parallelograms(rows: NDArray[np.float64], material: Material) -> Mesh:
+    """The mesh of rows [N, 12] of `Faces`, which have one material."""
+    origin, side, other = rows[:, 0:3], rows[:, 3:6], rows[:, 6:9]
+    tile_m, offset = rows[:, 9:10], rows[:, 10:12]
+    points = np.stack([origin, origin + side, origin + side + other, origin + other], 1)
+    lengths = np.stack([np.linalg.norm(side, axis=1), np.linalg.norm(other, axis=1)], 1)
+    # One repeat in all where no size is given.
+    repeats = np.where(tile_m > 0, lengths / np.where(tile_m > 0, tile_m, 1.0), 1.0)
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    uv = square * repeats[:, None] + offset[:, None]
+    normal = np.cross(side, other)
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    order = np.array([[0, 1, 2], [0, 2, 3]])
+    count = 2 * len(rows)
+    return Mesh(
+        points[:, order].reshape(count, 3, 3).astype(np.float32),
+        np.repeat(normal, 6, 0).reshape(count, 3, 3).astype(np.float32),
+        uv[:, order].reshape(count, 3, 2).astype(np.float32),
+        np.zeros(count, np.int32),
+        (material,),
+    )

@@ -36,6 +36,7 @@ from worlds.views import VALID, View
 
 VIEW_QUALITY = 95  # of JPEGs without a camera's faults
 WORLDS_PER_SHARD = 8
+ROOMS_PREFIX = "worlds"  # of the names of archives with rooms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,9 +49,9 @@ class StoredView:
     valid: NDArray[np.uint8]  # [H, W] 1: a surface, 2: the sky, 0: seen through glass
 
 
-def shard_file(folder: Path, number: int) -> Path:
-    """The file of the shard with this number."""
-    return folder / f"worlds-{number:05d}.tar"
+def shard_file(folder: Path, number: int, prefix: str = ROOMS_PREFIX) -> Path:
+    """The file of the shard with this number, of rooms or of what another prefix says."""
+    return folder / f"{prefix}-{number:05d}.tar"
 
 
 def pack_world(

@@ -46,15 +46,21 @@ class Surface:
     roughness: float
 
 
+# A surface's picture (None if it is not wanted, because its file is there), the width of one
+# repeat in metres, its specular share and its roughness. These three are drawn first, so that they
+# are the same with and without the picture.
+Drawn = tuple[Image3 | None, float, float, float]
+Draw = Callable[[Rng, bool], Drawn]
+
+
 def surfaces(folder: Path, kind: str) -> list[Surface]:
     """All surfaces of a kind; drawn into `folder` at the first call."""
-    return _surfaces(folder, kind)
+    return drawn_surfaces(folder, kind, KINDS[kind])
 
 
 @functools.lru_cache(64)
-def _surfaces(folder: Path, kind: str) -> list[Surface]:
-    """See `surfaces`."""
-    draw = KINDS[kind]
+def drawn_surfaces(folder: Path, kind: str, draw: Draw) -> list[Surface]:
+    """The surfaces that `draw` makes; kept in `folder` under the name of their kind."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for number in range(PER_KIND):
@@ -68,12 +74,6 @@ def _surfaces(folder: Path, kind: str) -> list[Surface]:
                 )
         found.append(Surface(kind, str(path), tile_m, specular, roughness))
     return found
-
-
-# A surface's picture (None if it is not wanted, because its file is there), the width of one
-# repeat in metres, its specular share and its roughness. These three are drawn first, so that they
-# are the same with and without the picture.
-Drawn = tuple[Image3 | None, float, float, float]
 
 
 def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -407,7 +407,7 @@ def concrete(rng: Rng, wanted: bool) -> Drawn:
     )
 
 
-KINDS: dict[str, Callable[[Rng, bool], Drawn]] = {
+KINDS: dict[str, Draw] = {
     "planks": planks,
     "parquet": parquet,
     "tiles": tiles,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,15 +66,17 @@ def choose_viewpoint(
 
     None if all of them stand in furniture.
     """
-    best = None
-    best_score = -math.inf
-    for _ in range(CANDIDATES):
-        candidate = _random_viewpoint(rng, place, height, width)
-        score = _score(world, candidate)
-        if score > best_score:
-            best = candidate
-            best_score = score
-    return best if best_score > 0 else None
+    candidates = [_random_viewpoint(rng, place, height, width) for _ in range(CANDIDATES)]
+    return best_viewpoint(world, candidates)
+
+
+def best_viewpoint(
+    world: World, candidates: Sequence[Viewpoint], near_m: float = MIN_NEAR_M
+) -> Viewpoint | None:
+    """The candidate that shows the most; None if all stand in a thing, or nearer than `near_m`."""
+    scores = [_score(world, candidate, near_m) for candidate in candidates]
+    best = int(np.argmax(scores))
+    return candidates[best] if scores[best] > 0 else None
 
 
 def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpoint:
@@ -111,10 +114,10 @@ def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpo
     pitch = np.clip(math.atan2(forward[2], flat), -0.6, 0.2)
     azimuth = math.atan2(forward[1], forward[0])
     roll = math.radians(rng.normal(0, 1.5))
-    return Viewpoint(eye.astype(np.float32), _axes(azimuth, float(pitch), roll), camera)
+    return Viewpoint(eye.astype(np.float32), camera_axes(azimuth, float(pitch), roll), camera)
 
 
-def _axes(azimuth: float, pitch: float, roll: float) -> Floats:
+def camera_axes(azimuth: float, pitch: float, roll: float) -> Floats:
     """[3, 3] rows right, down and forward of a camera that looks along an azimuth, upwards by
     `pitch`, and is rolled clockwise.
     """
@@ -130,16 +133,16 @@ def _axes(azimuth: float, pitch: float, roll: float) -> Floats:
     return np.stack([rolled_right, rolled_down, forward]).astype(np.float32)
 
 
-def _score(world: World, viewpoint: Viewpoint) -> float:
+def _score(world: World, viewpoint: Viewpoint, near_m: float) -> float:
     """How much a camera shows: many surfaces at many depths; negative where it is blocked."""
     rows, columns = PROBE
     camera = viewpoint.camera.resized(columns, rows)
     origins, directions = viewpoint.rays(camera, pixel_grid(rows, columns))
     hits = world.first_hits(origins, directions)
     depth = hits.distance[hits.triangle >= 0]
-    if len(depth) < 0.5 * rows * columns or np.quantile(depth, 0.01) < MIN_NEAR_M:
+    if len(depth) < 0.5 * rows * columns or np.quantile(depth, 0.01) < near_m:
         return -1.0
-    if np.quantile(depth, 0.3) < 0.7:  # something fills the picture
+    if np.quantile(depth, 0.3) < 0.7 + 3 * (near_m - MIN_NEAR_M):  # something fills the picture
         return -0.5
     # Many materials (the entropy of their shares of the picture), near and far things, and not
     # too much sky.

@@ -58,7 +58,12 @@ class _Traced:
 
 
 def render(
-    rng: Rng, world: World, lights: Lights, viewpoint: Viewpoint, cameras: list[Camera]
+    rng: Rng,
+    world: World,
+    lights: Lights,
+    viewpoint: Viewpoint,
+    cameras: list[Camera],
+    coarse_m: float = COARSE_M,
 ) -> list[View]:
     """The views of a world from several cameras, lit alike.
 
@@ -67,6 +72,7 @@ def render(
         world, lights: the world.
         viewpoint: the photo's camera.
         cameras: the views' cameras, in the photo's coordinates.
+        coarse_m: width of the coarse cells of light in metres.
     """
     traced = [_trace(world, viewpoint, camera) for camera in cameras]
     # The light is found once, on all surfaces that any view sees.
@@ -80,7 +86,7 @@ def render(
         np.concatenate([one.smooth[m] for one, m in zip(traced, met, strict=True)]),
         viewpoint.eye,
         focal_px,
-        COARSE_M,
+        coarse_m,
     )
     return [_finished(rng, world, lights, irradiance, viewpoint, one) for one in traced]
 
@@ -251,6 +257,10 @@ def _shaded(
         shaded = _with_reflections(
             world, lights, irradiance, shaded, positions, normals, towards, material
         )
+        if np.isfinite(lights.haze_m):
+            # Haze takes the light of far surfaces, and gives that of the sky.
+            clear = np.exp(-part.distance * lengths[found] / lights.haze_m)[:, None]
+            shaded = shaded * clear + (1 - clear) * lights.haze_color
         colors[found] = shaded
     # Panes darken what is behind them, and mirror some of the room.
     pane = 1 - hits.passed

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from worlds.shards import StoredView, read_view, world_keys
+from worlds.shards import ROOMS_PREFIX, StoredView, read_view, world_keys
 
 Bytes = NDArray[np.uint8]
 TILE = (252, 336)  # height and width of a picture on the sheet
@@ -43,10 +43,20 @@ def _tile(picture: Bytes) -> Bytes:
     return np.asarray(tile)
 
 
-def sheet(folder: Path, count: int, with_views: bool, first: int = 0) -> Bytes:
-    """[H, W, 3] the photos of `count` worlds; `with_views`: a row each with depth and views."""
+def sheet(
+    folder: Path, count: int, with_views: bool, first: int = 0, prefix: str = ROOMS_PREFIX
+) -> Bytes:
+    """[H, W, 3] the photos of `count` worlds; `with_views`: a row each with depth and views.
+
+    Args:
+        folder: of archives.
+        count: at most this many worlds.
+        with_views: whether each world gets a row.
+        first: how many worlds are passed over.
+        prefix: how the archives' names begin.
+    """
     tiles: list[list[Bytes]] = []
-    for path in sorted(folder.glob("worlds-*.tar")):
+    for path in sorted(folder.glob(f"{prefix}-*.tar")):
         for key in world_keys(path):
             if first > 0:
                 first -= 1
@@ -75,8 +85,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=48)
     parser.add_argument("--first", type=int, default=0, help="how many to pass over")
     parser.add_argument("--views", action="store_true", help="with depth and second views")
+    parser.add_argument(
+        "--prefix", default=ROOMS_PREFIX, help="how archives' names begin: worlds, streets, tracks"
+    )
     options = parser.parse_args(arguments)
-    picture = sheet(options.folder, options.count, options.views, options.first)
+    picture = sheet(options.folder, options.count, options.views, options.first, options.prefix)
     Image.fromarray(picture).save(options.output)
 
 

@@ -115,3 +115,10 @@ def test_rooms_for_validation_are_a_group_without_sky_and_none_that_is_trained_o
 
     with pytest.raises(InputError, match=r"validation_worlds has rooms of data\.worlds"):
         LiteFiles.of(data.model_copy(update={"validation_worlds": tmp_path / "learned"}))
+
+
+def test_streets_are_read_with_rooms_and_tracks_are_not(tmp_path: Path) -> None:
+    for name in ("worlds-00000.tar", "streets-00000.tar", "tracks-00000.tar"):
+        write_rooms(tmp_path / name)
+    archives = {view.archive.name for view in of_rooms(tmp_path)}
+    assert archives == {"worlds-00000.tar", "streets-00000.tar"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,8 @@ Ks 0.5 0.5 0.5
 Ns 100
 """
 # Name, width, depth, height in cm, and the height on which things stand.
-MODELS = (
+MadeModel = tuple[str, int, int, int, str | None]
+MODELS: tuple[MadeModel, ...] = (
     ("sofa", 180, 80, 80, "40"),
     ("chair", 45, 45, 85, "45"),
     ("table", 140, 80, 75, None),
@@ -57,13 +59,13 @@ MODELS = (
 )
 
 
-def write_catalogue(path: Path) -> None:
+def write_catalogue(path: Path, models: Sequence[MadeModel] = MODELS) -> None:
     """Write a catalogue whose models are all boxes."""
     lines = ["name=Boxes", "license=CC0"]
     picture = io.BytesIO()
     Image.new("RGB", (8, 8), (200, 60, 40)).save(picture, "PNG")
     with zipfile.ZipFile(path, "w") as archive:
-        for number, (name, width, depth, height, top) in enumerate(MODELS, 1):
+        for number, (name, width, depth, height, top) in enumerate(models, 1):
             facts = {
                 "id": f"Boxes#{name}",
                 "name": name.title(),

@@ -36,7 +36,7 @@ def small_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Textures that are quickly drawn."""
     monkeypatch.setattr(surfaces, "SIDE", 64)
     monkeypatch.setattr(surfaces, "PER_KIND", 2)
-    surfaces._surfaces.cache_clear()
+    surfaces.drawn_surfaces.cache_clear()
 
 
 @pytest.fixture(scope="module")
