@@ -29,6 +29,7 @@ PAINTS = (
     (0.42, 0.28, 0.18), (0.55, 0.16, 0.14), (0.2, 0.28, 0.42), (0.16, 0.16, 0.17),
 )  # fmt: skip
 RoofKind = Literal["ridge along", "ridge across", "flat"]
+ROOFS: tuple[RoofKind, ...] = ("ridge along", "ridge across", "flat")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +91,12 @@ def choose_style(rng: Rng, find: FindSurface) -> Style:
         trim=material_of(find("concrete"), (1.2, 1.15, 1.1)) if rng.random() < 0.5 else None,
         shutters=paint(rng) if rng.random() < 0.22 else None,
     )
+
+
+def roof_kind(rng: Rng, town: bool) -> RoofKind:
+    """The kind of a roof: flat ones stand in towns, and gables towards the street in suburbs."""
+    shares = [0.6, 0.1, 0.3] if town else [0.5, 0.45, 0.05]
+    return ROOFS[int(rng.choice(3, p=shares))]
 
 
 def flat_polygon(

@@ -19,6 +19,7 @@ from worlds.fetch import open_library
 from worlds.library import Library, Model
 from worlds.meshes import rotation_z
 from worlds.pictures import linear_to_srgb
+from worlds.torcs import open_torcs
 
 SIDE_PX = 112
 CAPTION_PX = 12
@@ -78,8 +79,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder for the sheets")
     parser.add_argument("--cache", type=Path, default=None, help="where models are kept")
+    parser.add_argument("--torcs", action="store_true", help="the second set: tracks and cars")
     options = parser.parse_args()
-    sheets(open_library(options.cache), options.output)
+    library = open_torcs(options.cache) if options.torcs else open_library(options.cache)
+    sheets(library, options.output)
 
 
 if __name__ == "__main__":

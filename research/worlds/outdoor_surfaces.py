@@ -203,7 +203,7 @@ def panes(rng: Rng, wanted: bool) -> Drawn:
     x, y = _place()
     dark = rng.uniform(0.04, 0.16)
     room = _shaded(0.6 + 0.5 * y + 0.1 * _noise(rng, 3, 3), np.array([1.0, 0.95, 0.9]) * dark)
-    weight: NDArray[np.floating] = np.zeros_like(x)  # of the cloth before the room
+    weight = np.zeros_like(x)  # of the cloth before the room
     kind = rng.random()
     cloth = np.array([0.78, 0.76, 0.7]) * rng.uniform(0.55, 1.0)
     folds = 0.85 + 0.15 * np.sin(2 * np.pi * rng.integers(9, 16) * x + _noise(rng, 3, 3))
@@ -215,7 +215,7 @@ def panes(rng: Rng, wanted: bool) -> Drawn:
         weight = np.full_like(x, 0.55)
     elif kind < 0.75:  # a blind, partly down
         weight = (y < rng.uniform(0.2, 0.75)).astype(np.float64)
-        folds = 0.85 + 0.15 * (y * 24 % 1 > 0.2)
+        folds = np.where(y * 24 % 1 > 0.2, 1.0, 0.85)
     return room + (_shaded(folds, cloth) - room) * weight[..., None], 1.0, 0.09, 0.04
 
 

@@ -31,9 +31,12 @@ CAR_PAINTS = (
 FULL_DETAIL_M = 9.0  # trees nearer to the camera's usual place keep all their leaves
 TRIANGLES_NEAR = 130_000  # of a model at most, up to this distance from the usual place
 NEAR_M = 8.0
-FEW_TRIANGLES = 30_000  # models with fewer, such as clipped cypresses, are never thinned
 CLOUD_SIDE = 512  # pixels of the noise of clouds
-MAX_TREES = 900_000  # triangles of plants in a world; then no more are planted
+KERB_M = 0.12  # height of pavements and gardens above roads
+PEOPLE = (
+    "female01 female02 female03 male01 male02 male03 boyStanding girlStanding holdingFemale01 "
+    "holdingMale01 female-01-casual-clothing male-01-suit"
+)
 
 
 @dataclasses.dataclass
@@ -67,6 +70,11 @@ class Scene:
         )
         return not any(wider.meets(other) for other in self.taken)
 
+    def away(self, x: float, y: float) -> float:
+        """Metres to the camera's usual place, which is (0, 0); what is behind it counts as far."""
+        distance = math.hypot(x, y)
+        return distance if y > -4 else 3 * distance
+
     def put(
         self,
         models: Sequence[Model],
@@ -93,8 +101,8 @@ class Scene:
             painted: whether it gets another colour, as cars do.
             solid: whether it takes its place from others; crowns of trees do not.
         """
-        # Far from the camera's usual place, which is (0, 0), models are simple ones, if there are.
-        limit = TRIANGLES_NEAR / max(1.0, math.hypot(x, y) / NEAR_M) ** 2
+        # Far from the camera models are simple ones, if there are.
+        limit = TRIANGLES_NEAR / max(1.0, self.away(x, y) / NEAR_M) ** 2
         simple = [one for one in models if one.triangles * keep <= limit]
         if not simple:
             simple = sorted(models, key=lambda one: one.triangles)[:2]
@@ -113,7 +121,7 @@ class Scene:
             return False
         self.taken.append(region)
         mesh = self.library.mesh(model)
-        if keep < 1 and mesh.count > FEW_TRIANGLES:
+        if keep < 1:
             mesh = thinned(mesh, keep, int(self.rng.integers(1 << 30)))
         if painted:
             mesh = repainted(self.rng, mesh)
@@ -274,6 +282,11 @@ def held_camera(
     tilt = float(np.clip(rng.normal(pitch, 0.06), -0.3, 0.2))
     roll = math.radians(rng.normal(0, 1.2))
     return Viewpoint(np.array(eye, np.float32), camera_axes(azimuth, tilt, roll), camera)
+
+
+def eye_height(rng: Rng) -> float:
+    """Metres above the ground: standing in most cases, sometimes stooping."""
+    return float(rng.uniform(1.35, 1.75) if rng.random() < 0.8 else rng.uniform(0.6, 1.3))
 
 
 DrawViewpoint = Callable[[Rng, int, int], Viewpoint]  # by height and width of the picture

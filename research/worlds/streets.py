@@ -1,10 +1,9 @@
-"""Streets and gardens by rules, from the first set of models. Read `street` and `garden` first.
+"""Streets by rules, from the first set of models. Read `street` first.
 
     street   a road with pavements, kerbs and lines; houses on both sides, in rows or apart, with
              gardens, fences and hedges before them; cars parked and driving, trees, lamps, people
-    garden   a lawn behind a house, with a terrace, beds, hedges or fences around, trees, toys
 
-The road runs along y, and the camera stands near y = 0.
+The road runs along y, and the camera stands near y = 0. `gardens` has the rules of gardens.
 """
 
 from __future__ import annotations
@@ -14,24 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from worlds.houses import (
-    METAL,
-    RoofKind,
-    choose_style,
-    house,
-    leafy,
-    paint,
-)
+from worlds.gardens import garden
+from worlds.houses import choose_style, house, roof_kind
 from worlds.library import Library
-from worlds.meshes import Faces, Material, Mesh, box, joined, quad, rotation_z
-from worlds.outdoors import FULL_DETAIL_M, MAX_TREES, Scene, daylight, held_camera, plain
+from worlds.meshes import Faces, Material, Mesh, joined, quad, rotation_z
+from worlds.outdoors import KERB_M, PEOPLE, Scene, daylight, eye_height, held_camera, plain
 from worlds.placing import Box
 from worlds.plans import OpenPlan
+from worlds.planting import CLIMATES, SHRUBS, border, hedge, plant
 from worlds.shell import material_of
 from worlds.viewpoints import Viewpoint
 
 Rng = np.random.Generator
-KERB_M = 0.12  # height of pavements above the road
 BEGIN, END = -24.0, 115.0  # of the street along y
 CARS = (
     "fordFocus concept-sedan-01v2 concept-sedan-01v1 concept-sedan-02 VW-new-beetle seat_leon "
@@ -39,20 +32,6 @@ CARS = (
 )
 LARGE_CARS = "bus cityBus truck van"
 TWO_WHEELS = "bicycle bike scooter2 yamaha-yzr-r6 scooter"
-PEOPLE = (
-    "female01 female02 female03 male01 male02 male03 boyStanding girlStanding holdingFemale01 "
-    "holdingMale01 female-01-casual-clothing male-01-suit"
-)
-# Trees of one climate stand together.
-CLIMATES = (
-    "acacia poplar pine ficusTree cypress bush",
-    "copperBeech japaneseMaple poplar pine sycamoreMaple",
-    "palm coconutTree cypress ficusTree sabalPalmeto",
-    "peachBlossom poplar acacia ficusTree",
-)
-SHRUBS = "bush hedge high-hedge plant decorativePlant flowerBox plantie"
-GREENS = ((0.2, 0.3, 0.1), (0.15, 0.25, 0.09), (0.28, 0.34, 0.12), (0.22, 0.24, 0.13))
-ROOFS: tuple[RoofKind, ...] = ("ridge along", "ridge across", "flat")
 
 
 def street_or_garden(rng: Rng, library: Library, cache: Path) -> OpenPlan:
@@ -103,7 +82,7 @@ def street(rng: Rng, library: Library, cache: Path) -> OpenPlan:
         else:
             x = own.choice([-1, 1]) * (edge + own.uniform(-0.2, min(1.0, garden_m + 0.01)))
         level = KERB_M if abs(x) > road else 0.0
-        eye = (float(x), float(own.uniform(-3, 3)), level + _eye_height(own))
+        eye = (float(x), float(own.uniform(-3, 3)), level + eye_height(own))
         # Along the street, a little towards its other side; sometimes straight at the houses.
         turn = own.normal(0, 0.22) + 0.16 * np.sign(x)
         if own.random() < 0.22:
@@ -119,11 +98,6 @@ def street(rng: Rng, library: Library, cache: Path) -> OpenPlan:
         models=tuple(sorted(scene.used)),
         coarse_m=1.0,
     )
-
-
-def _eye_height(rng: Rng) -> float:
-    """Metres above the ground: standing in most cases, sometimes stooping."""
-    return float(rng.uniform(1.35, 1.75) if rng.random() < 0.8 else rng.uniform(0.6, 1.3))
 
 
 def _ground(scene: Scene, road: float, walk: float, garden_m: float) -> None:
@@ -194,7 +168,7 @@ def _ground(scene: Scene, road: float, walk: float, garden_m: float) -> None:
 
 
 def _disc(scene: Scene, x: float, y: float, z: float, radius: float, material: Material) -> None:
-    """A flat disc on the ground, with a raised cross."""
+    """A flat disc on the ground: the cover of a drain."""
     angle = 2 * math.pi * np.arange(17) / 16
     ring = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle), np.full(17, z)], -1)
     corners = np.stack([np.broadcast_to((x, y, z), (16, 3)), ring[:-1], ring[1:]], 1)
@@ -225,7 +199,7 @@ def _houses(scene: Scene, side: int, edge: float, garden_m: float, town: bool) -
     terrace = town or rng.random() < 0.3
     floors = int(rng.integers(2, 5)) if town else int(rng.integers(1, 3))
     width = rng.uniform(6, 9)
-    roof = ROOFS[int(rng.choice(3, p=[0.6, 0.1, 0.3] if town else [0.5, 0.45, 0.05]))]
+    roof = roof_kind(rng, town)
     same = rng.random() < 0.4  # one builder, one style
     while y < END:
         if not same:
@@ -233,7 +207,7 @@ def _houses(scene: Scene, side: int, edge: float, garden_m: float, town: bool) -
             width = rng.uniform(6, 13) if town else rng.uniform(7, 12)
             if rng.random() < 0.6:
                 floors = int(rng.integers(2, 6)) if town else int(rng.integers(1, 3))
-                roof = ROOFS[int(rng.choice(3, p=[0.6, 0.1, 0.3] if town else [0.5, 0.45, 0.05]))]
+                roof = roof_kind(rng, town)
         if terrace and roof == "ridge across":
             roof = "ridge along"
         gap = 0.0 if terrace else rng.uniform(2.5, 7)
@@ -269,128 +243,24 @@ def _front_gardens(scene: Scene, side: int, edge: float, deep: float, climate: s
         length = rng.uniform(6, 11)
         gate = rng.uniform(1.2, 3.2)
         near = -8 < y < 30
-        _border(scene, side, edge + 0.1, y, y + length - gate, near)
+        border(scene, side, edge + 0.1, y, y + length - gate, near)
         # A border between two neighbours.
         if rng.random() < 0.5:
             low, high = sorted((side * (edge + 0.4), side * (edge + deep - 0.2)))
             height = rng.uniform(0.7, 1.5)
-            _hedge(scene, (low, y - 0.3, KERB_M), (high, y + 0.2, KERB_M + height))
+            hedge(scene, (low, y - 0.3, KERB_M), (high, y + 0.2, KERB_M + height))
         for _ in range(int(rng.integers(1, 4))):
             x = side * rng.uniform(edge + 0.8, edge + deep - 0.6)
             at = rng.uniform(y + 0.5, y + length - 0.5)
-            _plant(scene, SHRUBS, x, at, tree=False)
+            plant(scene, SHRUBS, x, at, tree=False)
         if deep > 3 and rng.random() < 0.3 and -8 < y < 60:
             at = y + rng.uniform(1, length - 1)
             x = side * (edge + deep * rng.uniform(0.3, 0.6))
-            _plant(scene, climate, x, at)
+            plant(scene, climate, x, at)
         if rng.random() < 0.35 and near:
             things = scene.find("mofx_mailbox residential-trashcan bicycle wheelbarrow tricycle")
             scene.put(things, side * (edge + 0.7), y + length - gate / 2, KERB_M, -90.0 * side)
         y += length
-
-
-def _plant(scene: Scene, names: str, x: float, y: float, *, tree: bool = True) -> None:
-    """A tree or shrub at a place, unless something stands there or there are plants enough.
-
-    Those that are far from the camera's usual place, which is (0, 0), have fewer, larger leaves.
-    """
-    rng = scene.rng
-    models = scene.find(names)
-    if scene.leaves > MAX_TREES or not models:
-        return
-    model = models[int(rng.integers(len(models)))]
-    away = max(math.hypot(x, y), 1.0)
-    keep = min(1.0, (FULL_DETAIL_M / away) ** 1.3)
-    planted = scene.put([model], x, y, KERB_M - 0.02, rng.uniform(0, 360),
-                        scale=rng.uniform(0.75, 1.25), keep=keep, solid=not tree)  # fmt: skip
-    if planted:
-        scene.leaves += int(model.triangles * keep)
-
-
-def _hedge(
-    scene: Scene,
-    low: tuple[float, float, float],
-    high: tuple[float, float, float],
-) -> None:
-    """A clipped hedge from one corner to the other."""
-    rng = scene.rng
-    one, other = np.array(low), np.array(high)
-    size = other - one
-    surface = 2 * size[2] * (size[0] + size[1]) + size[0] * size[1]  # m²
-    # Leaves of a far hedge are larger; a kite of length l covers 0.28 l².
-    nearest = np.clip(0, one[:2], other[:2])
-    leaf = 0.075 * max(1.0, float(np.linalg.norm(nearest)) / 6)
-    count = int(min(25_000, surface * 1.5 / (0.28 * leaf * leaf)))
-    scene.leaves += 2 * count
-    green = GREENS[int(rng.integers(len(GREENS)))]
-    scene.parts.append(leafy(rng, one, other, count, green, leaf))
-    scene.taken.append(Box(low[0], low[1], high[0], high[1], low[2], high[2]))
-
-
-def _border(scene: Scene, side: int, x: float, y0: float, y1: float, near: bool) -> None:
-    """What stands between a garden and the pavement: hedge, wall, fence, railing or nothing."""
-    rng = scene.rng
-    if y1 - y0 < 1:
-        return
-    kind = rng.random()
-    base = KERB_M
-    low, high = sorted((side * x, side * (x + 0.25)))
-    scene.taken.append(Box(low, y0, high, y1, 0, 1.2))
-    if kind < 0.3:
-        height = rng.uniform(0.7, 1.6)
-        low, high = sorted((side * x, side * (x + 0.55)))
-        _hedge(scene, (low, y0, base), (high, y1, base + height))
-        return
-    if kind < 0.6:
-        skin = scene.surface("stone_wall", "brick", "plaster")
-        height = rng.uniform(0.4, 1.1)
-        tile = (skin.tile_m, skin.tile_m)
-        cap = material_of(scene.surface("concrete"))
-        scene.parts.append(box((low, y0, 0), (high, y1, base + height), material_of(skin), tile))
-        scene.parts.append(
-            box((low - 0.04, y0 - 0.03, base + height),
-                (high + 0.04, y1 + 0.03, base + height + 0.06), cap)
-        )  # fmt: skip
-        if rng.random() < 0.35:
-            _hedge(
-                scene, (low + 0.02, y0, base + height), (high - 0.02 + 0.2, y1, base + height + 0.5)
-            )
-        return
-    if kind < 0.9:
-        _fence(scene, (side * x, y0), (side * x, y1), rng.uniform(0.8, 1.2), near)
-
-
-def _fence(
-    scene: Scene, start: tuple[float, float], end: tuple[float, float], height: float, near: bool
-) -> None:
-    """A fence between two points on the ground: of boards, or of iron bars."""
-    rng = scene.rng
-    length = math.dist(start, end)
-    along = (np.array(end) - np.array(start)) / length
-    across = np.array([-along[1], along[0]])
-    z = KERB_M
-    wooden = rng.random() < 0.65
-    skin = paint(rng) if rng.random() < 0.6 else material_of(scene.surface("wood"))
-    if not wooden:
-        skin = METAL if rng.random() < 0.5 else plain((0.08, 0.1, 0.09), 0.05, 0.3)
-    step = 0.13 if wooden else 0.11
-    step *= 1 if near else 2
-    wide = 0.09 if wooden else 0.018
-    faces = Faces()
-    # In the fence's own axes: x along it, y through it.
-    for at in np.arange(0.05, length, step):
-        top = z + height * (1 + (0.01 * rng.normal() if wooden else 0))
-        faces.box((at, 0, z + 0.06), (at + wide, 0.02, top), skin)
-    for level in (0.25, 0.85):
-        bar = z + level * height
-        faces.box((0, 0.02, bar), (length, 0.05, bar + 0.06), skin)
-    every = max(1.8, length / max(1, round(length / 2.2)))
-    for at in np.arange(0, length + 0.01, every):
-        faces.box((at - 0.05, 0.02, 0), (at + 0.05, 0.12, z + height + 0.08), skin)
-    turn = np.eye(3)
-    turn[:2, 0] = along
-    turn[:2, 1] = across
-    scene.parts.append(faces.mesh().moved(turn, (*start, 0)))
 
 
 def _pavement(scene: Scene, side: int, road: float, walk: float, town: bool, climate: str) -> None:
@@ -408,7 +278,7 @@ def _pavement(scene: Scene, side: int, road: float, walk: float, town: bool, cli
         every = rng.uniform(7, 14)
         one = climate.split()[int(rng.integers(len(climate.split())))]
         for y in np.arange(rng.uniform(-6, 8), 75, every):
-            _plant(scene, one, row, y)
+            plant(scene, one, row, y)
     for _ in range(int(rng.integers(2, 9)) if town else int(rng.integers(0, 5))):
         x = side * rng.uniform(road + 0.5, road + walk - 0.3)
         y = rng.uniform(2.0, 35)
@@ -482,161 +352,4 @@ def _end_of_street(scene: Scene, climate: str) -> None:
         mesh = house(rng, scene.surface, style, width, 10, int(rng.integers(2, 5)), "ridge along")
         scene.parts.append(mesh.moved(np.eye(3), (-width / 2, END + 14, KERB_M)))
     for _ in range(5):
-        _plant(scene, climate, rng.uniform(-14, 14), END + rng.uniform(2, 12))
-
-
-def garden(rng: Rng, library: Library, cache: Path) -> OpenPlan:
-    """A garden behind a house, with its light. The house stands at its far end, the camera before.
-
-    Args:
-        rng: for all random choices.
-        library: the first set of models.
-        cache: below which surfaces are kept.
-    """
-    scene = Scene(rng, library, cache)
-    wide = rng.uniform(10, 22)
-    deep = rng.uniform(10, 24)
-    climate = CLIMATES[int(rng.integers(len(CLIMATES)))]
-    lawn = scene.surface("grass")
-    tile = (lawn.tile_m, lawn.tile_m)
-    half = wide / 2
-    scene.parts.append(
-        quad((-400, -400, KERB_M), (800, 0, 0), (0, 800, 0), material_of(lawn), tile)
-    )
-    # The house, its neighbours, and a terrace before it.
-    style = choose_style(rng, scene.surface)
-    width = min(wide - 1, rng.uniform(8, 13))
-    shift = rng.uniform(-(wide - width) / 2, (wide - width) / 2)
-    roofs = ROOFS[int(rng.choice(3, p=[0.5, 0.4, 0.1]))]
-    own = house(rng, scene.surface, style, width, 9, int(rng.integers(1, 3)), roofs)
-    scene.parts.append(own.moved(np.eye(3), (shift - width / 2, deep, KERB_M)))
-    scene.taken.append(Box(-half, deep - 0.2, half, deep + 12, 0, 12))
-    for side in (-1, 1):
-        other = choose_style(rng, scene.surface)
-        near = house(
-            rng, scene.surface, other, rng.uniform(8, 12), 9, int(rng.integers(1, 3)), roofs
-        )
-        x = half + 3 if side > 0 else -half - 14
-        scene.parts.append(near.moved(np.eye(3), (x, deep + rng.uniform(-3, 5), KERB_M)))
-    slabs = scene.surface("paving", "planks", "tiles")
-    out = rng.uniform(2.5, 4.5)
-    left = shift - width / 2 * rng.uniform(0.5, 1)
-    right = shift + width / 2 * rng.uniform(0.5, 1)
-    scene.parts.append(
-        box((left, deep - out, KERB_M - 0.1), (right, deep, KERB_M + 0.07),
-            material_of(slabs), (slabs.tile_m,) * 2)
-    )  # fmt: skip
-    _terrace(scene, left, right, deep - out, deep)
-
-    # Hedges, fences or walls at both sides and behind the camera.
-    for start, end in (((-half, -8.0), (-half, deep)), ((half, deep), (half, -8.0))):
-        if rng.random() < 0.5:
-            x = start[0]
-            height = rng.uniform(1.0, 2.1)
-            _hedge(scene, (x - 0.35, -8, KERB_M), (x + 0.35, deep, KERB_M + height))
-        else:
-            _fence(scene, start, end, rng.uniform(0.9, 1.9), True)
-            scene.taken.append(Box(start[0] - 0.2, -8, start[0] + 0.2, deep, 0, 2))
-    # Beds along the borders, with shrubs and flowers.
-    soil = scene.surface("earth")
-    for side in (-1, 1):
-        if rng.random() < 0.8:
-            broad = rng.uniform(0.7, 1.6)
-            low, high = sorted((side * half, side * (half - broad)))
-            scene.parts.append(
-                quad((low, 0, KERB_M + 0.015), (high - low, 0, 0), (0, deep, 0),
-                     material_of(soil), (soil.tile_m,) * 2)
-            )  # fmt: skip
-            for _ in range(int(rng.integers(4, 10))):
-                plants = scene.find(
-                    "bush hedge plant decorativePlant spider_plant tulips tulip white_lily "
-                    "rock1 rock2 rock3 yuccaPlant mediumIndoorPlant"
-                )
-                x = side * (half - rng.uniform(0.45, broad))
-                scene.put(plants, x, rng.uniform(1, deep - 1), KERB_M, rng.uniform(0, 360),
-                          scale=rng.uniform(0.8, 1.4), margin=-0.05)  # fmt: skip
-    for _ in range(int(rng.integers(1, 4))):
-        x = rng.uniform(-half + 1, half - 1)
-        _plant(scene, climate, x, rng.uniform(4, deep - out - 0.5))
-    for _ in range(6):  # beyond the borders
-        x = rng.choice([-1, 1]) * rng.uniform(half + 4, half + 25)
-        _plant(scene, climate, x, deep + rng.uniform(5, 40))
-    big = "childHut childSwing parque trampoline rectangle-swimming-pool garden-hut hammock " \
-          "child_swing fountain campingTent"  # fmt: skip
-    small = "dog-house sandpit wheelbarrow ballonFoot tricycle deckChair relaxChair poolLounge " \
-            "beach_chair round-swimming-pool seesaw stoneLantern lantern football-goal " \
-            "bench hose-reel umbrella"  # fmt: skip
-    for names, count in ((big, int(rng.integers(0, 3))), (small, int(rng.integers(2, 7)))):
-        for _ in range(count):
-            x = rng.uniform(-half + 1.5, half - 1.5)
-            y = rng.uniform(2.5, deep - out - 1)
-            scene.put(scene.find(names), x, y, KERB_M, rng.uniform(0, 360), margin=0.2)
-    for _ in range(int(rng.integers(0, 4))):
-        x = rng.uniform(-half + 1.5, half - 1.5)
-        people = scene.find(PEOPLE + " dog cat")
-        scene.put(people, x, rng.uniform(2.5, deep - 0.6), KERB_M, rng.uniform(0, 360))
-
-    def draw(draws: Rng, height: int, width_px: int) -> Viewpoint:
-        """A camera at the garden's end or at one of its sides, which looks towards the house."""
-        x = draws.uniform(-half + 0.8, half - 0.8)
-        y = draws.uniform(-2, 0.4 * deep)
-        eye = np.array([x, y, KERB_M + _eye_height(draws)])
-        target = np.array([draws.uniform(-half, half) * 0.7, deep])
-        azimuth = math.atan2(target[1] - y, target[0] - x)
-        return held_camera(draws, eye.tolist(), azimuth, height, width_px, -0.07)
-
-    return OpenPlan(
-        kind="garden",
-        mesh=joined(scene.parts),
-        pictures=scene.pictures,
-        lights=daylight(rng),
-        draw_viewpoint=draw,
-        models=tuple(sorted(scene.used)),
-        coarse_m=0.6,
-    )
-
-
-def _terrace(scene: Scene, left: float, right: float, y0: float, y1: float) -> None:
-    """Table and chairs, a sofa or deck chairs, flower pots, an umbrella."""
-    rng = scene.rng
-    z = KERB_M + 0.07
-    middle = ((left + right) / 2 + rng.normal(0, 0.5), (y0 + y1) / 2)
-    if rng.random() < 0.6:
-        chairs = "silla_teca foldingChair cafe-chair plasticChair rattanArmchair"
-        chair = (
-            [scene.find(chairs)[int(rng.integers(len(scene.find(chairs))))]]
-            if scene.find(chairs)
-            else []
-        )
-        tables = "table-on-trestles cafe-table oakTable round-table folding-table"
-        if scene.put(scene.find(tables), *middle, z, 0.0):
-            for x, y, turn in (
-                (-0.5, -0.75, 180),
-                (0.5, -0.75, 180),
-                (-0.5, 0.75, 0),
-                (0.5, 0.75, 0),
-            ):
-                if rng.random() < 0.8:
-                    scene.put(
-                        chair,
-                        middle[0] + x,
-                        middle[1] + y,
-                        z,
-                        turn + rng.normal(0, 12),
-                        margin=-0.2,
-                    )
-            if rng.random() < 0.4:
-                scene.put(
-                    scene.find("umbrella"), *middle, z, 0.0, solid=False, margin=-0.4, scale=1.15
-                )
-    else:
-        if scene.put(scene.find("rattanSofa ext_chair wood_bank"), middle[0], y1 - 0.8, z, 0.0):
-            scene.put(scene.find("rattanTable ext_table"), middle[0], y1 - 1.9, z, 0.0)
-        scene.put(scene.find("rattanArmchair silla_teca"), middle[0] + 1.5, y1 - 1.6, z, -70.0)
-    for _ in range(int(rng.integers(2, 7))):
-        pots = scene.find(
-            "flowerBox plantie maceta plant decorativePlant bonsai-tree ficus yuccaPlant"
-        )
-        scene.put(
-            pots, rng.uniform(left + 0.3, right - 0.3), rng.uniform(y0 + 0.2, y1 - 0.3), z, 0.0
-        )
+        plant(scene, climate, rng.uniform(-14, 14), END + rng.uniform(2, 12))

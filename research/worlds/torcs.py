@@ -31,6 +31,7 @@ FREE_ART = "Free Art License 1.3"
 GPL = "GPL-2.0-or-later"
 TRACK, CAR = "Tracks", "Cars"  # categories
 INCH_M = 0.0254
+SKIN_M = 0.004  # half of a car body's thickness
 # Cars with fewer triangles look like boxes.
 CARS = (
     "car1-stock1", "car1-stock2", "car1-trb1", "car1-trb3", "car2-trb1", "car3-trb1",
@@ -165,6 +166,9 @@ def _pictures(path: Path, game: Path) -> ReadPicture:
 def _read_car(path: Path) -> Mesh:
     """A car on its wheels, which looks along −y and stands on z = 0, as catalogue models do."""
     body = _read(path / path.name)
+    # Bodies have an outer and an inner skin at one place, which look to opposite sides.
+    apart = body.corners + SKIN_M * body.normals
+    body = dataclasses.replace(body, corners=apart.astype(np.float32))
     facts = (path / f"{path.name}.xml").read_text(encoding="latin1")
     kinds = re.findall(r'name="3d wheel directory"[^>]*val="([^"]+)"', facts)
     kind = kinds[0] if kinds else USUAL_WHEEL

@@ -16,6 +16,7 @@ pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 from worlds import outdoor_surfaces, surfaces, views
 from worlds.ac3d_files import read_ac3d
 from worlds.caster import World
+from worlds.gardens import garden
 from worlds.houses import Hole, choose_style, holed_wall, house, leafy, pole
 from worlds.library import Library
 from worlds.make import make_open_world, make_shards
@@ -23,7 +24,7 @@ from worlds.meshes import Faces, Material, Mesh, box, face_normals, joined, quad
 from worlds.outdoors import Scene, repainted, thinned
 from worlds.plans import OpenPlan
 from worlds.shards import read_view, world_facts, world_keys, write_shard
-from worlds.streets import garden, street
+from worlds.streets import street
 from worlds.torcs import COPYRIGHT, FREE_ART, GAME, GPL, convert
 from worlds.tracks import fine_picture, road_triangles, track
 from worlds.viewpoints import Viewpoint, camera_axes
