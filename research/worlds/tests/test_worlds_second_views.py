@@ -14,6 +14,7 @@ from torch import Tensor
 
 pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 
+from worlds.judge_residual import judge, views_of_worlds
 from worlds.photo_camera import Development, developed, photographed
 from worlds.second_views import (
     BASES,
@@ -36,6 +37,7 @@ from spackle.core.filters import maximum_filter
 from spackle.paper.training.losses import hole_psnr
 from spackle.render import get_renderer
 from spackle.residual.architectures import load_residual
+from spackle.residual.features import hole_mask
 
 pytestmark = pytest.mark.slow
 HEIGHT, WIDTH = 60, 80
@@ -243,3 +245,23 @@ def test_training_in_miniature_learns_from_worlds_and_resumes(
     assert json.loads((out / "run.json").read_text())["step"] == 4
     assert main([*command, f"worlds.validation={tmp_path}/worlds", "optim.steps=4"]) == 2
     assert "give each archive to one of them" in capsys.readouterr().err
+
+
+def test_weights_are_judged_in_the_holes_of_the_true_second_views(tmp_path: Path) -> None:
+    write_worlds(shard_file(tmp_path, 7), first=0, count=1)
+    views = list(views_of_worlds(tmp_path))
+    assert {view.group for view in views} == {"worlds, true"}
+
+    def features(images: Tensor) -> list[Tensor]:
+        """The images themselves, as the features of a network."""
+        return [images]
+
+    figures, pictures = judge(views, [None, None], features, alone=True)  # type: ignore[arg-type]
+    for row, shown, view in zip(figures["worlds, true"], pictures, views, strict=True):
+        assert row[0] == row[1]
+        assert torch.equal(shown[-1], view.truth)
+        hole = hole_mask(get_renderer().render(view.base.gaussians, view.camera).alpha).numpy()
+        difference = (shown[1] - view.truth).numpy().astype(float)[hole]
+        assert row[0][0] == pytest.approx(-10 * math.log10((difference**2).mean()), abs=1e-3)
+        # The hole is filled at all: black would be far from the wall's colours.
+        assert row[0][0] > 15
