@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from spackle.runtime.errors import InputError
 from worlds.library import Library
 from worlds.lights import cloud_noise
 from worlds.meshes import Material, Mesh, joined
@@ -33,22 +34,21 @@ NO_ROAD_WORDS = ("barrier", "wall", "curb", "shadow", "raceline", "grass", "side
 SMOOTH_WORDS = ("tree", "arbor", "forest", "bush", "sky", "people", "spec", "logo", "sign")
 FLAT_COSINE = 0.9  # a road rises by less than 26 degrees
 FINE_PX = 1024  # pictures of the ground are enlarged to this width
-PLACES = 40  # of a track that are tried
 
 
 def track(rng: Rng, library: Library) -> OpenPlan:
     """A place at a race track, with its light.
 
     Raises:
-        ValueError: the drawn track has no road.
+        InputError: the drawn track has no road.
     """
     tracks = [model for model in library.models if model.entry.category == TRACK]
     cars = [model for model in library.models if model.entry.category == CAR]
     model = tracks[int(rng.integers(len(tracks)))]
     mesh = library.mesh(model)
-    road = road_triangles(mesh)
+    road = road_triangles(mesh, model.entry.name)
     if not len(road):
-        raise ValueError(f"{model.entry.key}: no road")
+        raise InputError(f"{model.entry.key}: no picture is that of a road: leave this track out")
 
     # The middle of a random part of the road becomes the origin.
     corners = mesh.corners[road]
@@ -106,23 +106,26 @@ def track(rng: Rng, library: Library) -> OpenPlan:
     )
 
 
-def road_triangles(mesh: Mesh) -> NDArray[np.int64]:
-    """The indices of triangles that are road, by the names of their pictures and their slope."""
-    is_road = np.array([_is_road(one) for one in mesh.materials], bool)
+def road_triangles(mesh: Mesh, name: str) -> NDArray[np.int64]:
+    """The indices of triangles that are road, by the names of their pictures and their slope.
+
+    `name` is the track's; pictures in the library begin with it.
+    """
+    is_road = np.array([_is_road(one, name) for one in mesh.materials], bool)
     sides = mesh.corners[:, 1:].astype(np.float64) - mesh.corners[:, :1]
     normal = np.cross(sides[:, 0], sides[:, 1])
     flat = np.abs(normal[:, 2]) > FLAT_COSINE * np.linalg.norm(normal, axis=1)
     return np.flatnonzero(is_road[mesh.material] & flat)
 
 
-def _is_road(material: Material) -> bool:
-    """Whether a material's picture is that of a road."""
+def _is_road(material: Material, track_name: str) -> bool:
+    """Whether a material's picture is that of a road, by its name without the track's."""
     if material.texture is None:
         return False
-    name = Path(material.texture).name.lower()
-    return any(word in name for word in ROAD_WORDS) and not any(
-        word in name for word in NO_ROAD_WORDS
-    )
+    name = Path(material.texture).name.removeprefix(f"{track_name}-").lower()
+    if any(word in name for word in NO_ROAD_WORDS):
+        return False
+    return any(word in name for word in ROAD_WORDS)
 
 
 def _direction(corners: Floats, place: NDArray[np.floating]) -> NDArray[np.float64]:
