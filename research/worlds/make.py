@@ -31,7 +31,7 @@ from worlds.caster import World
 from worlds.fetch import cache_folder, open_library
 from worlds.furniture import Furniture
 from worlds.library import Library
-from worlds.photo_camera import choose_development, photographed
+from worlds.photo_camera import BALANCED, choose_development, photographed
 from worlds.photo_camera import developed as develop
 from worlds.plans import OpenPlan
 from worlds.rooms import DrawPhoto, WorldPlan, furnish
@@ -55,6 +55,7 @@ UPRIGHT = 0.25  # share of worlds whose photo is upright
 ATTEMPTS = 20  # rooms that may show too little, one after another
 MIN_KNOWN = 0.6  # share of a photo with a known surface
 OPEN_MIN_KNOWN = 0.5  # in the open, where the sky is not a surface
+OPEN_BALANCED = (0.05, 0.45)  # range of the share of a cast that white balance takes away there
 OPEN_NEAR_M = 0.8  # nearer things in the open fill the picture
 VERSION = 2  # increases whenever the same seed gives other rooms
 OPEN_VERSION = 1  # and other streets, gardens and tracks
@@ -193,7 +194,8 @@ def _packed(
     views = render(rng, world, plan.lights, viewpoint, [camera, *cameras], coarse_m)
     if (views[0].valid == VALID).mean() < min_known:
         return None
-    settings = choose_development(rng, views[0].radiance)
+    balanced = OPEN_BALANCED if isinstance(plan, OpenPlan) else BALANCED
+    settings = choose_development(rng, views[0].radiance, balanced)
     jpeg = photographed(rng, develop(views[0].radiance, settings), settings)
     facts = {
         "version": VERSION,

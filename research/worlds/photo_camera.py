@@ -15,6 +15,7 @@ from worlds.pictures import linear_to_srgb
 Rng = np.random.Generator
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
+BALANCED = (0.4, 0.95)  # range of the share of a light's cast that white balance takes away
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,8 +33,14 @@ class Development:
     jpeg: int  # quality
 
 
-def choose_development(rng: Rng, radiance: Floats) -> Development:
-    """Settings of a camera that meters a view [H, W, 3], and is not always right."""
+def choose_development(
+    rng: Rng, radiance: Floats, balanced: tuple[float, float] = BALANCED
+) -> Development:
+    """Settings of a camera that meters a view [H, W, 3], and is not always right.
+
+    `balanced` is the range of the share of a cast that white balance takes away. In the open it is
+    lower, because green there is grass and not a lamp's light.
+    """
     brightness = radiance @ np.array([0.2126, 0.7152, 0.0722], np.float32)
     middle = float(np.median(brightness))
     mean = float(np.minimum(brightness, 6 * middle + 1e-4).mean())
@@ -43,7 +50,7 @@ def choose_development(rng: Rng, radiance: Floats) -> Development:
     capped = np.minimum(radiance, 4 * max(mean, 1e-4))
     grey = capped.reshape(-1, 3).mean(0)
     cast = grey / max(float(grey.mean()), 1e-6)
-    balance = cast ** -float(rng.uniform(0.4, 0.95)) * np.exp(rng.normal(0, 0.03, 3))
+    balance = cast ** -float(rng.uniform(*balanced)) * np.exp(rng.normal(0, 0.03, 3))
     return Development(
         exposure=exposure,
         white_balance=balance.astype(np.float32),

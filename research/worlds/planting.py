@@ -58,8 +58,8 @@ def hedge(
     surface = 2 * size[2] * (size[0] + size[1]) + size[0] * size[1]  # m²
     # Leaves of a far hedge are larger; a kite of length l covers 0.28 l².
     nearest = np.clip(0, one[:2], other[:2])
-    leaf = 0.075 * max(1.0, float(np.linalg.norm(nearest)) / 6)
-    count = int(min(25_000, surface * 1.5 / (0.28 * leaf * leaf)))
+    leaf = 0.06 * max(1.0, float(np.linalg.norm(nearest)) / 6)
+    count = int(min(30_000, surface * 1.5 / (0.28 * leaf * leaf)))
     scene.leaves += 2 * count
     green = GREENS[int(rng.integers(len(GREENS)))]
     scene.parts.append(leafy(rng, one, other, count, green, leaf))

@@ -41,7 +41,7 @@ CARS = (
 NO_TRACKS = (
     "brondehach", "forza", "a-speedway", "b-speedway", "c-speedway", "d-speedway", "e-speedway",
     "f-speedway", "g-speedway", "e-track-4", "e-track-5", "eroad", "g-track-2", "mixed-2",
-    "ole-road-1", "dirt-1", "dirt-2", "dirt-3", "dirt-4", "dirt-5", "dirt-6",
+    "ole-road-1", "spring", "dirt-1", "dirt-2", "dirt-3", "dirt-4", "dirt-5", "dirt-6",
 )  # fmt: skip
 USUAL_WHEEL = "trb1-1"  # for cars that name none
 

@@ -68,8 +68,8 @@ def track(rng: Rng, library: Library) -> OpenPlan:
     across = np.array([-direction[1], direction[0]])
     local = (corners - middle)[np.linalg.norm((corners - middle)[:, :, :2].mean(1), axis=1) < 120]
     width = _half_width(local, across)
-    for _ in range(int(rng.integers(1, 7))):
-        away = rng.uniform(7, 45) * rng.choice([1, 1, 1, -1])
+    for _ in range(int(rng.integers(2, 9))):
+        away = rng.uniform(6, 35) * rng.choice([1, 1, 1, -1])
         side = rng.uniform(-0.7, 0.7) * width
         car = cars[int(rng.integers(len(cars)))] if cars else None
         place = _on_road(local, direction * away + across * side)
