@@ -4,7 +4,8 @@
     python benchmarks/strangers.py ends photos.txt -o ends
     python benchmarks/strangers.py sheets ends -o SHEETS --key key.json
     python benchmarks/strangers.py pairs old_ends new_ends -o PAIRS --key key.json
-    python benchmarks/strangers.py ratings READER.json... --key key.json
+    python benchmarks/strangers.py pairs old_ends new_ends -o SWAPPED --key swapped.json --swapped
+    python benchmarks/strangers.py ratings READER.json... --key key.json...
 
 `draw` writes the names of photos that are drawn at random, equally many from each folder. `ends`
 completes each photo as `spackle predict` does with its default settings and `--base lite`, and
@@ -13,11 +14,13 @@ version of the code is compared by `ends` in a second checkout; a setting by `--
 or `--disparity`.
 
 `sheets` puts both ends of a photo side by side into one picture without a name, in random order;
-`pairs` those of two versions one above the other, of which A and B are drawn anew for each photo.
+`pairs` those of two versions one above the other; each version is A, the upper row, for a random
+half of the photos. Readers may prefer a row, whatever it shows: with `--swapped` the rows of all
+pictures are exchanged, for every second reader.
 README.txt beside the pictures tells a reader what to rate. The key, which says what is what, is
 never within the readers' folder. `ratings` collects what readers wrote: the mean of their ratings,
 the share of 4 and 5, and the flaws that they saw at first sight, at the picture's border and
-inside.
+inside. It takes one key for all readers, or one for each.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ from spackle.bases.settings import BaseSettings
 from spackle.core.color import to_uint8
 from spackle.core.photo import load_photo
 from spackle.pipeline import FillOptions, Pipeline, PipelineOptions
+from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Reporter
 from spackle.views import PathOptions
 
@@ -170,22 +174,30 @@ def write_sheets(ends: Path, output: Path, key: Path, seed: int) -> None:
     key.write_text(json.dumps({number: {"photo": name} for number, name in numbers.items()}))
 
 
-def write_pairs(old: Path, new: Path, output: Path, key: Path, seed: int) -> None:
-    """Write a numbered picture for each photo, with the two versions' ends in random order.
+def write_pairs(
+    old: Path, new: Path, output: Path, key: Path, seed: int, *, swapped: bool = False
+) -> None:
+    """Write a numbered picture for each photo, with the two versions' ends one above the other.
 
-    A photo whose four frames are the same in both versions is left out.
+    A photo whose four frames are the same in both versions is left out. Each version is in the
+    upper row for a random half of the other photos; with `swapped`, rows are exchanged in all.
     """
     chance = random.Random(seed)
     names = [name for name in photo_names(old) if name in set(photo_names(new))]
     chance.shuffle(names)
-    output.mkdir(parents=True, exist_ok=True)
-    entries: dict[str, dict[str, str]] = {}
+    rows_by_name: dict[str, dict[str, Image.Image]] = {}
     for name in names:
         rows = {"old": both_ends(old, name), "new": both_ends(new, name)}
-        if np.array_equal(np.asarray(rows["old"]), np.asarray(rows["new"])):
-            continue
+        if not np.array_equal(np.asarray(rows["old"]), np.asarray(rows["new"])):
+            rows_by_name[name] = rows
+    is_new_above = [index % 2 == 0 for index in range(len(rows_by_name))]
+    chance.shuffle(is_new_above)
+
+    output.mkdir(parents=True, exist_ok=True)
+    entries: dict[str, dict[str, str]] = {}
+    for (name, rows), new_above in zip(rows_by_name.items(), is_new_above, strict=True):
+        order = ("new", "old") if new_above != swapped else ("old", "new")
         number = f"{len(entries) + 1:02d}"
-        order = chance.sample(VERSIONS, len(VERSIONS))
         joined([rows[version] for version in order], across=False).save(output / f"{number}.png")
         entries[number] = {"photo": name, **dict(zip(SIDES, order, strict=True))}
     (output / "README.txt").write_text(RATING_TEXT + PAIR_TEXT)
@@ -195,19 +207,29 @@ def write_pairs(old: Path, new: Path, output: Path, key: Path, seed: int) -> Non
 # Ratings ------------------------------------------------------------------------------------------
 
 
-def collect(readings: Sequence[dict[str, Any]], key: dict[str, dict[str, str]]) -> str:
+def collect(readings: Sequence[dict[str, Any]], keys: Sequence[dict[str, dict[str, str]]]) -> str:
     """A table of what readers wrote: a row for each version, or one for sheets of one version.
 
-    For pairs, a line says how often each version was preferred.
+    For pairs, a line says how often each version was preferred, and another how often each row,
+    which would be equally often if readers looked at the pictures alone.
 
     Args:
         readings: each reader's file.
-        key: what `sheets` or `pairs` has written.
+        keys: what `sheets` or `pairs` has written for each reader, or one key for all.
+
+    Raises:
+        InputError: there are several keys, but not one for each reader.
     """
+    if len(keys) not in (1, len(readings)):
+        raise InputError(
+            f"{len(keys)} keys for {len(readings)} readers: give one for all, or one for each"
+        )
+    keys = keys if len(keys) == len(readings) else [keys[0]] * len(readings)
     answers: dict[str, list[dict[str, Any]]] = {}  # by version
     preferences = {"old": 0, "new": 0, "same": 0}
-    is_pairs = all("A" in entry for entry in key.values())
-    for reading in readings:
+    rows_preferred = {"A": 0, "B": 0}
+    is_pairs = all("A" in entry for key in keys for entry in key.values())
+    for reading, key in zip(readings, keys, strict=True):
         for number, entry in key.items():
             answer = reading[number]
             if not is_pairs:
@@ -215,7 +237,10 @@ def collect(readings: Sequence[dict[str, Any]], key: dict[str, dict[str, str]]) 
                 continue
             for side in SIDES:
                 answers.setdefault(entry[side], []).append(answer[side])
-            preferences[entry.get(answer["better"], "same")] += 1
+            better = answer["better"]
+            preferences[entry.get(better, "same")] += 1
+            if better in rows_preferred:
+                rows_preferred[better] += 1
 
     rows = [
         [version, *summary(answers[version], len(readings))]
@@ -228,7 +253,8 @@ def collect(readings: Sequence[dict[str, Any]], key: dict[str, dict[str, str]]) 
         return table
     chance = sign_test(preferences["new"], preferences["old"])
     counts = ", ".join(f"{version} {count}" for version, count in preferences.items())
-    return f"{table}\n\npreferred: {counts} (sign test: p = {chance:.3f})"
+    by_row = f"upper row {rows_preferred['A']}, lower row {rows_preferred['B']}"
+    return f"{table}\n\npreferred: {counts} (sign test: p = {chance:.3f}); {by_row}"
 
 
 def summary(answers: Sequence[dict[str, Any]], readers: int) -> list[str]:
@@ -270,14 +296,18 @@ def parser() -> argparse.ArgumentParser:
     pairs = commands.add_parser("pairs")
     pairs.add_argument("old", type=Path)
     pairs.add_argument("new", type=Path)
+    pairs.add_argument("--swapped", action="store_true", help="exchange A and B in all pictures")
     ratings = commands.add_parser("ratings")
     ratings.add_argument("readings", type=Path, nargs="+")
     for command in (drawing, ends, sheets, pairs):
         command.add_argument("-o", "--output", type=Path, required=True)
     for command in (drawing, sheets, pairs):
         command.add_argument("--seed", type=int, default=0)
-    for command in (sheets, pairs, ratings):
+    for command in (sheets, pairs):
         command.add_argument("--key", type=Path, required=True)
+    ratings.add_argument(
+        "--key", type=Path, nargs="+", required=True, help="one for all readers, or one for each"
+    )
     return top
 
 
@@ -300,10 +330,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif chosen.command == "sheets":
         write_sheets(chosen.ends, chosen.output, chosen.key, chosen.seed)
     elif chosen.command == "pairs":
-        write_pairs(chosen.old, chosen.new, chosen.output, chosen.key, chosen.seed)
+        write_pairs(
+            chosen.old,
+            chosen.new,
+            chosen.output,
+            chosen.key,
+            chosen.seed,
+            swapped=chosen.swapped,
+        )
     else:
         readings = [json.loads(file.read_text()) for file in chosen.readings]
-        print(collect(readings, json.loads(chosen.key.read_text())))
+        print(collect(readings, [json.loads(file.read_text()) for file in chosen.key]))
 
 
 if __name__ == "__main__":

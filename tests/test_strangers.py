@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 import strangers
 from PIL import Image
 
 from spackle.bases.settings import BaseSettings
 from spackle.pipeline import FillOptions, PipelineOptions
+from spackle.runtime.errors import InputError
 from spackle.views import PathOptions
 
 HEIGHT = 36
@@ -74,7 +76,7 @@ def test_a_pair_hides_which_version_is_which_and_the_key_tells(tmp_path: Path) -
 
     # The photo that both versions show alike is left out; sides change from photo to photo.
     assert {entry["photo"] for entry in entries.values()} == {f"photo{n}" for n in range(8)}
-    assert {entry["A"] for entry in entries.values()} == {"old", "new"}
+    assert [entry["A"] for entry in entries.values()].count("new") == 4
     assert sorted(file.name for file in sheets.iterdir()) == [
         *(f"{number:02d}.png" for number in range(1, 9)),
         "README.txt",
@@ -84,6 +86,42 @@ def test_a_pair_hides_which_version_is_which_and_the_key_tells(tmp_path: Path) -
         colors = {"old": red, "new": blue}
         assert tuple(picture[0, 0]) == colors[entry["A"]]
         assert tuple(picture[HEIGHT + strangers.GAP_PX, 0]) == colors[entry["B"]]
+
+
+def test_swapped_pairs_exchange_the_rows_of_the_same_pictures(tmp_path: Path) -> None:
+    for number in range(5):
+        save_ends(tmp_path / "old", f"photo{number}", (255, 0, 0))
+        save_ends(tmp_path / "new", f"photo{number}", (0, 0, 255))
+    folders = [str(tmp_path / "old"), str(tmp_path / "new")]
+    entries = []
+    for name, options in (("pairs", []), ("swapped", ["--swapped"])):
+        key = tmp_path / f"{name}.json"
+        output = ["-o", str(tmp_path / name), "--key", str(key)]
+        strangers.main(["pairs", *folders, *output, *options])
+        entries.append(json.loads(key.read_text()))
+    plain, swapped = entries
+    assert list(plain) == list(swapped)
+    for number, entry in plain.items():
+        other = swapped[number]
+        assert (entry["photo"], entry["A"], entry["B"]) == (other["photo"], other["B"], other["A"])
+        above, below = (
+            np.asarray(Image.open(tmp_path / name / f"{number}.png"))
+            for name in ("pairs", "swapped")
+        )
+        assert np.array_equal(above[:HEIGHT], below[HEIGHT + strangers.GAP_PX :][:HEIGHT])
+
+
+def test_a_reader_who_prefers_a_row_is_seen_and_cancels_with_a_swapped_one() -> None:
+    plain = {"01": {"photo": "cat", "A": "new", "B": "old"}}
+    swapped = {"01": {"photo": "cat", "A": "old", "B": "new"}}
+    rated = {"rating": 4, "border": False, "inside": False, "flaw": ""}
+    always_below = {"01": {"A": rated, "B": rated, "better": "B"}}
+    report = strangers.collect([always_below, always_below], [plain, swapped])
+    assert report.endswith(
+        "preferred: old 1, new 1, same 0 (sign test: p = 1.000); upper row 0, lower row 2"
+    )
+    with pytest.raises(InputError, match="2 keys for 3 readers"):
+        strangers.collect([always_below] * 3, [plain, swapped])
 
 
 def test_ratings_of_pairs_are_collected_by_version() -> None:
@@ -99,10 +137,12 @@ def test_ratings_of_pairs_are_collected_by_version() -> None:
         "01": {"A": answer(5, False), "B": answer(2, True), "better": "A"},
         "02": {"A": answer(1, True), "B": answer(4, True), "better": "same"},
     }
-    rows = strangers.collect([reading, reading], key).splitlines()
+    rows = strangers.collect([reading, reading], [key]).splitlines()
     assert rows[2] == "| old | 1.50 | 0% | 1.0 | 2.0 of 2 | 0.0 of 2 |"
     assert rows[3] == "| new | 4.50 | 100% | 0.0 | 1.0 of 2 | 0.0 of 2 |"
-    assert rows[-1] == "preferred: old 0, new 2, same 2 (sign test: p = 0.500)"
+    assert rows[-1] == (
+        "preferred: old 0, new 2, same 2 (sign test: p = 0.500); upper row 2, lower row 0"
+    )
 
 
 def test_ratings_of_sheets_are_collected(tmp_path: Path) -> None:
@@ -117,5 +157,5 @@ def test_ratings_of_sheets_are_collected(tmp_path: Path) -> None:
         "01": {"rating": 3, "border": True, "inside": True, "flaw": ""},
         "02": {"rating": 4, "border": False, "inside": True, "flaw": ""},
     }
-    table = strangers.collect([reading], json.loads(key.read_text()))
+    table = strangers.collect([reading], [json.loads(key.read_text())])
     assert "| all | 3.50 | 50% | 0.0 | 1.0 of 2 | 2.0 of 2 |" in table
