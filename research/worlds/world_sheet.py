@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from spackle.runtime.errors import InputError
 from worlds.shards import ROOMS_PREFIX, StoredView, read_view, world_keys
 
 Bytes = NDArray[np.uint8]
@@ -54,6 +55,9 @@ def sheet(
         with_views: whether each world gets a row.
         first: how many worlds are passed over.
         prefix: how the archives' names begin.
+
+    Raises:
+        InputError: there is no world to show.
     """
     tiles: list[list[Bytes]] = []
     for path in sorted(folder.glob(f"{prefix}-*.tar")):
@@ -69,6 +73,11 @@ def sheet(
                 row.append(_tile(depth_picture(photo)))
                 row += [_tile(read_view(path, key, number).rgb) for number in SECOND_SHOWN]
             tiles.append(row)
+    if not tiles:
+        raise InputError(
+            f"{folder}: no world to show in archives {prefix}-NNNNN.tar: give another folder, "
+            "another --prefix, or a smaller --first"
+        )
     if not with_views:
         flat = [row[0] for row in tiles]
         empty = np.full((*TILE, 3), 24, np.uint8)
@@ -89,7 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--prefix", default=ROOMS_PREFIX, help="how archives' names begin: worlds, streets, tracks"
     )
     options = parser.parse_args(arguments)
-    picture = sheet(options.folder, options.count, options.views, options.first, options.prefix)
+    try:
+        picture = sheet(options.folder, options.count, options.views, options.first, options.prefix)
+    except InputError as error:
+        parser.error(str(error))
     Image.fromarray(picture).save(options.output)
 
 

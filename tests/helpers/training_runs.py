@@ -79,11 +79,14 @@ class Started:
 
 
 def _run(arguments: Sequence[str], code: str, environment: dict[str, str], errors: Any) -> None:
-    """Run code and then a command in the process that has started."""
+    """Run code and then a command in the process that has started; the code may itself be another
+    command, which takes the arguments and exits.
+    """
     os.environ.clear()
     os.environ.update(environment)
     torch.set_num_threads(1)
-    exec(code, {})
+    sys.argv = ["spackle", *arguments]
+    exec(code, {"sys": sys})
     done = run(*arguments)
     errors.send(done.err)
     sys.exit(done.code)

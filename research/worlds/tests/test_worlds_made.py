@@ -12,7 +12,7 @@ from made_models import lights, write_catalogue
 
 pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 
-from worlds import surfaces, views
+from worlds import surfaces, views, world_sheet
 from worlds.furniture import Furniture
 from worlds.library import Library
 from worlds.make import make_shards, make_world
@@ -186,3 +186,14 @@ def test_outlines_are_mixed_and_depth_is_not(furniture: Furniture, cache: Path) 
     assert row[9] > 0.95
     assert set(np.round(view.depth.reshape(-1), 3).tolist()) == {2.0, 4.0}
     np.testing.assert_allclose(view.normal[4, 9], [0, 0, -1], atol=1e-5)
+
+
+def test_a_sheet_of_a_folder_without_worlds_says_so_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(tmp_path), "-o", str(tmp_path / "sheet.png"), "--prefix", "streets"]
+    with pytest.raises(SystemExit) as ended:
+        world_sheet.main(arguments)
+    assert ended.value.code == 2
+    assert "no world to show in archives streets-NNNNN.tar" in capsys.readouterr().err
+    assert not (tmp_path / "sheet.png").exists()
