@@ -1,4 +1,9 @@
-"""Gardens behind houses by rules, from the first set of models."""
+"""Gardens behind houses by rules, from the first set of models (see `fetch`).
+
+All coordinates are metres. The garden lies around x = 0, from the camera at y ≈ 0 to the house at
+its far end; x is across the garden, z is up, and the lawn is at z = KERB_M. A model that is put at
+an angle of 0° looks towards −y, to the camera.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,14 @@ from worlds.meshes import box, joined, quad
 from worlds.outdoors import KERB_M, PEOPLE, Scene, daylight, eye_height, held_camera
 from worlds.placing import Box
 from worlds.plans import OpenPlan
-from worlds.planting import CLIMATES, fence, hedge, plant
+from worlds.planting import TREES_OF_CLIMATES, fence, hedge, plant
 from worlds.shell import material_of
 from worlds.viewpoints import Viewpoint
 
 Rng = np.random.Generator
+BEGIN = -8.0  # y of the ends of hedges and fences behind the camera
+TERRACE_M = 0.07  # height of a terrace above the lawn
+# Models' names, separated by spaces, as `Scene.find` takes them.
 LARGE = (
     "childHut childSwing parque trampoline rectangle-swimming-pool garden-hut hammock child_swing "
     "fountain campingTent"
@@ -33,163 +41,196 @@ FLOWERS = (
 
 
 def garden(rng: Rng, library: Library, cache: Path) -> OpenPlan:
-    """A garden behind a house, with its light. The house stands at its far end, the camera before.
+    """A garden that ends at a house: its triangles, light, cameras, and the models in it.
+
+    The garden lies around x = 0; the house stands at its far end, at y = `depth`, and the camera
+    before it, near y = 0. Coordinates are metres with z up.
 
     Args:
         rng: for all random choices.
-        library: the first set of models.
-        cache: below which surfaces are kept.
+        library: the models that stand in it, those of `fetch.open_library`.
+        cache: a folder; the pictures of made surfaces are kept in its folder `surfaces`, because
+            they take long to draw and many worlds share them.
     """
     scene = Scene(rng, library, cache)
-    wide = rng.uniform(10, 22)
-    deep = rng.uniform(10, 24)
-    climate = CLIMATES[int(rng.integers(len(CLIMATES)))]
+    width = rng.uniform(10, 22)  # of the garden, from x = −width / 2 to width / 2
+    depth = rng.uniform(10, 24)  # from the camera's place to the house
+    trees = TREES_OF_CLIMATES[int(rng.integers(len(TREES_OF_CLIMATES)))]
     lawn = scene.surface("grass")
-    tile = (lawn.tile_m, lawn.tile_m)
-    half = wide / 2
+    half_width = width / 2
+    # Grass to the horizon.
+    lawn_tile = (lawn.tile_m, lawn.tile_m)
     scene.parts.append(
-        quad((-400, -400, KERB_M), (800, 0, 0), (0, 800, 0), material_of(lawn), tile)
+        quad((-400, -400, KERB_M), (800, 0, 0), (0, 800, 0), material_of(lawn), lawn_tile)
     )
-    # The house, its neighbours, and a terrace before it.
-    style = choose_style(rng, scene.surface)
-    width = min(wide - 1, rng.uniform(8, 13))
-    shift = rng.uniform(-(wide - width) / 2, (wide - width) / 2)
-    roofs = roof_kind(rng, town=False)
-    own = house(rng, scene.surface, style, width, 9, int(rng.integers(1, 3)), roofs)
-    scene.parts.append(own.moved(np.eye(3), (shift - width / 2, deep, KERB_M)))
-    scene.taken.append(Box(-half, deep - 0.2, half, deep + 12, 0, 12))
-    for side in (-1, 1):
-        other = choose_style(rng, scene.surface)
-        near = house(
-            rng, scene.surface, other, rng.uniform(8, 12), 9, int(rng.integers(1, 3)), roofs
-        )
-        x = half + 3 if side > 0 else -half - 14
-        scene.parts.append(near.moved(np.eye(3), (x, deep + rng.uniform(-3, 5), KERB_M)))
-    slabs = scene.surface("paving", "planks", "tiles")
-    out = rng.uniform(2.5, 4.5)
-    left = shift - width / 2 * rng.uniform(0.5, 1)
-    right = shift + width / 2 * rng.uniform(0.5, 1)
-    scene.parts.append(
-        box((left, deep - out, KERB_M - 0.1), (right, deep, KERB_M + 0.07),
-            material_of(slabs), (slabs.tile_m,) * 2)
-    )  # fmt: skip
-    _terrace(scene, left, right, deep - out, deep)
 
-    _borders(scene, half, deep)
+    # The house, 9 m deep, somewhere at the garden's far end, and its neighbours at both sides.
+    style = choose_style(rng, scene.surface)
+    house_width = min(width - 1, rng.uniform(8, 13))
+    most_shift = (width - house_width) / 2
+    house_x = rng.uniform(-most_shift, most_shift)  # its middle
+    roof = roof_kind(rng, town=False)
+    own_house = house(rng, scene.surface, style, house_width, 9, int(rng.integers(1, 3)), roof)
+    # A house looks towards −y as it is made, which is towards the garden.
+    scene.parts.append(own_house.moved(np.eye(3), (house_x - house_width / 2, depth, KERB_M)))
+    scene.taken.append(Box(-half_width, depth - 0.2, half_width, depth + 12, 0, 12))
+    for side in (-1, 1):
+        neighbour_style = choose_style(rng, scene.surface)
+        neighbour_width = rng.uniform(8, 12)
+        floors = int(rng.integers(1, 3))
+        neighbour = house(rng, scene.surface, neighbour_style, neighbour_width, 9, floors, roof)
+        # Its left end: 3 m beyond the border, or so that the widest ends 2 m before the border.
+        left = half_width + 3 if side > 0 else -half_width - 14
+        y = depth + rng.uniform(-3, 5)
+        scene.parts.append(neighbour.moved(np.eye(3), (left, y, KERB_M)))
+
+    # A terrace before the house, which reaches 10 cm into the ground.
+    slabs = scene.surface("paving", "planks", "tiles")
+    terrace_begin = depth - rng.uniform(2.5, 4.5)  # y of its end towards the camera
+    terrace_left = house_x - house_width / 2 * rng.uniform(0.5, 1)
+    terrace_right = house_x + house_width / 2 * rng.uniform(0.5, 1)
+    low = (terrace_left, terrace_begin, KERB_M - 0.1)
+    high = (terrace_right, depth, KERB_M + TERRACE_M)
+    scene.parts.append(box(low, high, material_of(slabs), (slabs.tile_m, slabs.tile_m)))
+    _furnish_terrace(scene, terrace_left, terrace_right, terrace_begin, depth)
+
+    _add_borders(scene, half_width, depth)
     for side in (-1, 1):
         if rng.random() < 0.8:
-            _bed(scene, side, half, deep)
-    for _ in range(int(rng.integers(1, 4))):
-        plant(scene, climate, rng.uniform(-half + 1, half - 1), rng.uniform(4, deep - out - 0.5))
-    for _ in range(6):  # beyond the borders
-        x = rng.choice([-1, 1]) * rng.uniform(half + 4, half + 25)
-        plant(scene, climate, x, deep + rng.uniform(5, 40))
+            _add_flower_bed(scene, side, half_width, depth)
+    for _ in range(int(rng.integers(1, 4))):  # trees on the lawn
+        x = rng.uniform(-half_width + 1, half_width - 1)
+        plant(scene, trees, x, rng.uniform(4, terrace_begin - 0.5))
+    for _ in range(6):  # trees beyond the borders, behind the house's front
+        x = rng.choice([-1, 1]) * rng.uniform(half_width + 4, half_width + 25)
+        plant(scene, trees, x, depth + rng.uniform(5, 40))
     for names, count in ((LARGE, int(rng.integers(0, 3))), (SMALL, int(rng.integers(2, 7)))):
         for _ in range(count):
-            x = rng.uniform(-half + 1.5, half - 1.5)
-            y = rng.uniform(2.5, deep - out - 1)
+            x = rng.uniform(-half_width + 1.5, half_width - 1.5)
+            y = rng.uniform(2.5, terrace_begin - 1)
             scene.put(scene.find(names), x, y, KERB_M, rng.uniform(0, 360), margin=0.2)
     for _ in range(int(rng.integers(0, 4))):
-        x = rng.uniform(-half + 1.5, half - 1.5)
-        people = scene.find(PEOPLE + " dog cat")
-        scene.put(people, x, rng.uniform(2.5, deep - 0.6), KERB_M, rng.uniform(0, 360))
+        x = rng.uniform(-half_width + 1.5, half_width - 1.5)
+        y = rng.uniform(2.5, depth - 0.6)
+        scene.put(scene.find(PEOPLE + " dog cat"), x, y, KERB_M, rng.uniform(0, 360))
 
-    def draw(draws: Rng, height: int, width_px: int) -> Viewpoint:
-        """A camera at the garden's end or at one of its sides, which looks towards the house."""
-        x = draws.uniform(-half + 0.8, half - 0.8)
-        y = draws.uniform(-2, 0.4 * deep)
-        eye = np.array([x, y, KERB_M + eye_height(draws)])
-        target = np.array([draws.uniform(-half, half) * 0.7, deep])
-        azimuth = math.atan2(target[1] - y, target[0] - x)
-        return held_camera(draws, eye.tolist(), azimuth, height, width_px, -0.07)
+    def draw_viewpoint(camera_rng: Rng, height_px: int, width_px: int) -> Viewpoint:
+        """A camera in the garden's nearer part, which looks at a point of the house's front."""
+        x = camera_rng.uniform(-half_width + 0.8, half_width - 0.8)
+        y = camera_rng.uniform(-2, 0.4 * depth)
+        eye = (float(x), float(y), float(KERB_M + eye_height(camera_rng)))
+        target_x = camera_rng.uniform(-half_width, half_width) * 0.7
+        azimuth = math.atan2(depth - y, target_x - x)
+        return held_camera(camera_rng, eye, azimuth, height_px, width_px, pitch=-0.07)
 
     return OpenPlan(
         kind="garden",
         mesh=joined(scene.parts),
         pictures=scene.pictures,
         lights=daylight(rng),
-        draw_viewpoint=draw,
+        draw_viewpoint=draw_viewpoint,
         models=tuple(sorted(scene.used)),
         coarse_m=0.6,
     )
 
 
-def _borders(scene: Scene, half: float, deep: float) -> None:
-    """A hedge or a fence at both sides of a garden that is 2 · `half` wide."""
+def _add_borders(scene: Scene, half_width: float, depth: float) -> None:
+    """Add a hedge or a fence at the left and at the right side of a garden.
+
+    Args:
+        scene: gets them.
+        half_width: metres; the sides are at x = ± this.
+        depth: metres; they end at y = `depth`, at the house.
+    """
     rng = scene.rng
-    for start, end in (((-half, -8.0), (-half, deep)), ((half, deep), (half, -8.0))):
+    # The ends of each are in this order so that a fence has its rails and posts outside.
+    left = ((-half_width, BEGIN), (-half_width, depth))
+    right = ((half_width, depth), (half_width, BEGIN))
+    for start, end in (left, right):
         x = start[0]
         if rng.random() < 0.5:
             height = rng.uniform(1.0, 2.1)
-            hedge(scene, (x - 0.35, -8, KERB_M), (x + 0.35, deep, KERB_M + height))
+            hedge(scene, (x - 0.35, BEGIN, KERB_M), (x + 0.35, depth, KERB_M + height))
         else:
-            fence(scene, start, end, rng.uniform(0.9, 1.9), True)
-            scene.taken.append(Box(x - 0.2, -8, x + 0.2, deep, 0, 2))
+            fence(scene, start, end, rng.uniform(0.9, 1.9), near_camera=True)
+            scene.taken.append(Box(x - 0.2, BEGIN, x + 0.2, depth, 0, 2))
 
 
-def _bed(scene: Scene, side: int, half: float, deep: float) -> None:
-    """Soil along one side of a garden, with shrubs, flowers and rocks."""
+def _add_flower_bed(scene: Scene, side: int, half_width: float, depth: float) -> None:
+    """Add a strip of soil along one side of a garden, with shrubs, flowers and rocks.
+
+    Args:
+        scene: gets them.
+        side: of the garden, +1 for x > 0, −1 for x < 0.
+        half_width: metres from the garden's middle, x = 0, to its side.
+        depth: metres; the bed goes from y = 0 to `depth`.
+    """
     rng = scene.rng
     soil = scene.surface("earth")
-    broad = rng.uniform(0.7, 1.6)
-    low, high = sorted((side * half, side * (half - broad)))
+    bed_width = rng.uniform(0.7, 1.6)
+    low_x, high_x = sorted((side * half_width, side * (half_width - bed_width)))
+    corner = (low_x, 0, KERB_M + 0.015)  # 15 mm above the lawn, so as to hide it
     tile = (soil.tile_m, soil.tile_m)
-    width = (high - low, 0, 0)
-    scene.parts.append(quad((low, 0, KERB_M + 0.015), width, (0, deep, 0), material_of(soil), tile))
+    scene.parts.append(quad(corner, (high_x - low_x, 0, 0), (0, depth, 0), material_of(soil), tile))
     for _ in range(int(rng.integers(4, 10))):
-        x = side * (half - rng.uniform(0.45, broad))
-        scene.put(
-            scene.find(FLOWERS),
-            x,
-            rng.uniform(1, deep - 1),
-            KERB_M,
-            rng.uniform(0, 360),
-            scale=rng.uniform(0.8, 1.4),
-            margin=-0.05,
-        )
+        x = side * (half_width - rng.uniform(0.45, bed_width))
+        y = rng.uniform(1, depth - 1)
+        angle = rng.uniform(0, 360)
+        scale = rng.uniform(0.8, 1.4)
+        # Plants may reach 5 cm into each other.
+        scene.put(scene.find(FLOWERS), x, y, KERB_M, angle, scale=scale, margin=-0.05)
 
 
-def _terrace(scene: Scene, left: float, right: float, y0: float, y1: float) -> None:
-    """Table and chairs, a sofa or deck chairs, flower pots, an umbrella."""
+def _furnish_terrace(scene: Scene, left: float, right: float, begin: float, end: float) -> None:
+    """Put a table with chairs or a sofa with an armchair on a terrace; then flower pots.
+
+    Args:
+        scene: gets them.
+        left, right: x of the terrace's ends in metres.
+        begin, end: y of its ends towards the camera and at the house.
+    """
     rng = scene.rng
-    z = KERB_M + 0.07
-    middle = ((left + right) / 2 + rng.normal(0, 0.5), (y0 + y1) / 2)
+    floor = KERB_M + TERRACE_M
+    x, y = (left + right) / 2 + rng.normal(0, 0.5), (begin + end) / 2
     if rng.random() < 0.6:
-        chairs = "silla_teca foldingChair cafe-chair plasticChair rattanArmchair"
-        chair = (
-            [scene.find(chairs)[int(rng.integers(len(scene.find(chairs))))]]
-            if scene.find(chairs)
-            else []
-        )
-        tables = "table-on-trestles cafe-table oakTable round-table folding-table"
-        if scene.put(scene.find(tables), *middle, z, 0.0):
-            for x, y, turn in (
-                (-0.5, -0.75, 180),
-                (0.5, -0.75, 180),
-                (-0.5, 0.75, 0),
-                (0.5, 0.75, 0),
-            ):
-                if rng.random() < 0.8:
-                    scene.put(
-                        chair,
-                        middle[0] + x,
-                        middle[1] + y,
-                        z,
-                        turn + rng.normal(0, 12),
-                        margin=-0.2,
-                    )
-            if rng.random() < 0.4:
-                scene.put(
-                    scene.find("umbrella"), *middle, z, 0.0, solid=False, margin=-0.4, scale=1.15
-                )
+        _add_table(scene, x, y, floor)
     else:
-        if scene.put(scene.find("rattanSofa ext_chair wood_bank"), middle[0], y1 - 0.8, z, 0.0):
-            scene.put(scene.find("rattanTable ext_table"), middle[0], y1 - 1.9, z, 0.0)
-        scene.put(scene.find("rattanArmchair silla_teca"), middle[0] + 1.5, y1 - 1.6, z, -70.0)
+        # A sofa before the house's wall, a low table before it, and an armchair to the right of
+        # both, turned towards the table.
+        if scene.put(scene.find("rattanSofa ext_chair wood_bank"), x, end - 0.8, floor, 0.0):
+            scene.put(scene.find("rattanTable ext_table"), x, end - 1.9, floor, 0.0)
+        scene.put(scene.find("rattanArmchair silla_teca"), x + 1.5, end - 1.6, floor, -70.0)
     for _ in range(int(rng.integers(2, 7))):
         pots = scene.find(
             "flowerBox plantie maceta plant decorativePlant bonsai-tree ficus yuccaPlant"
         )
-        scene.put(
-            pots, rng.uniform(left + 0.3, right - 0.3), rng.uniform(y0 + 0.2, y1 - 0.3), z, 0.0
-        )
+        pot_x = rng.uniform(left + 0.3, right - 0.3)
+        pot_y = rng.uniform(begin + 0.2, end - 0.3)
+        scene.put(pots, pot_x, pot_y, floor, 0.0)
+
+
+def _add_table(scene: Scene, x: float, y: float, floor: float) -> None:
+    """Put a table, if there is room for it, with up to four equal chairs and maybe an umbrella.
+
+    Args:
+        scene: gets them.
+        x, y: of the table's middle in metres.
+        floor: height on which all stand.
+    """
+    rng = scene.rng
+    chairs = scene.find("silla_teca foldingChair cafe-chair plasticChair rattanArmchair")
+    chair = [chairs[int(rng.integers(len(chairs)))]] if chairs else []
+    tables = scene.find("table-on-trestles cafe-table oakTable round-table folding-table")
+    if not scene.put(tables, x, y, floor, 0.0):
+        return
+    # From the table's middle to each chair, and the angle at which the chair looks at the table.
+    places = ((-0.5, -0.75, 180), (0.5, -0.75, 180), (-0.5, 0.75, 0), (0.5, 0.75, 0))
+    for dx, dy, angle in places:
+        if rng.random() < 0.8:
+            # Chairs stand a few degrees askew, and up to 0.2 m below the table.
+            askew = angle + rng.normal(0, 12)
+            scene.put(chair, x + dx, y + dy, floor, askew, margin=-0.2)
+    if rng.random() < 0.4:
+        # Through the table, so that it may reach 0.4 m into it.
+        umbrella = scene.find("umbrella")
+        scene.put(umbrella, x, y, floor, 0.0, solid=False, margin=-0.4, scale=1.15)

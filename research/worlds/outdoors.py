@@ -1,4 +1,8 @@
-"""What streets, gardens and tracks share: daylight, cameras in the open, trees, cars, people."""
+"""What streets, gardens and tracks share: daylight, cameras in the open, trees, cars, people.
+
+All coordinates are metres with z up. Angles of models are degrees, counterclockwise from above; at
+0° a model looks towards −y.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +32,15 @@ CAR_PAINTS = (
     (0.5, 0.06, 0.05), (0.08, 0.16, 0.36), (0.1, 0.24, 0.17), (0.62, 0.56, 0.44),
     (0.75, 0.4, 0.1), (0.28, 0.45, 0.6),
 )  # fmt: skip
-FULL_DETAIL_M = 9.0  # trees nearer to the camera's usual place keep all their leaves
-TRIANGLES_NEAR = 130_000  # of a model at most, up to this distance from the usual place
+# The camera's usual place is (0, 0), from where it looks towards +y.
+FULL_DETAIL_M = 9.0  # trees nearer to that place keep all their leaves
+# A model has at most `TRIANGLES_NEAR` triangles up to `NEAR_M` from that place; beyond, the limit
+# falls with the square of the distance, as the model's size in the picture does.
+TRIANGLES_NEAR = 130_000
 NEAR_M = 8.0
-CLOUD_SIDE = 512  # pixels of the noise of clouds
+CLOUD_SIDE = 512  # pixels of the square picture of noise from which clouds are made
 KERB_M = 0.12  # height of pavements and gardens above roads
+# Models' names, separated by spaces, as `Scene.find` takes them.
 PEOPLE = (
     "female01 female02 female03 male01 male02 male03 boyStanding girlStanding holdingFemale01 "
     "holdingMale01 female-01-casual-clothing male-01-suit"
@@ -43,35 +51,46 @@ PEOPLE = (
 class Scene:
     """A place in the open while it is being built: its parts, and what stands where."""
 
-    rng: Rng
+    rng: Rng  # for all random choices
     library: Library
-    cache: Path
+    cache: Path  # its folder `surfaces` keeps the pictures of made surfaces
     parts: list[Mesh] = dataclasses.field(default_factory=list)
+    # Textures that are no files, by the name that materials give.
     pictures: dict[str, Bytes] = dataclasses.field(default_factory=dict)
-    taken: list[Box] = dataclasses.field(default_factory=list)
-    used: set[str] = dataclasses.field(default_factory=set)  # keys of models
+    taken: list[Box] = dataclasses.field(default_factory=list)  # where nothing else may stand
+    used: set[str] = dataclasses.field(default_factory=set)  # keys of the models in it
     leaves: int = 0  # triangles of plants so far
 
     def surface(self, *kinds: str) -> Surface:
-        """A random surface of one of these kinds."""
+        """A random made surface of one of these kinds, each as likely as often it is given."""
         kind = kinds[int(self.rng.integers(len(kinds)))]
         found = outdoor_surfaces(self.cache / "surfaces", kind)
         return found[int(self.rng.integers(len(found)))]
 
     def find(self, names: str) -> list[Model]:
-        """The models with these names, separated by spaces."""
+        """The library's models with these names, separated by spaces; others are left out.
+
+        A name is the part of a model's key after the mark #.
+        """
         table = _by_name(self.library)
         return [model for name in names.split() for model in table.get(name, ())]
 
     def is_free(self, box: Box, margin: float = 0.0) -> bool:
-        """Whether nothing stands in a region, or within `margin` of it."""
+        """Whether nothing stands in a region, or within `margin` metres of its four sides.
+
+        A negative margin lets the region and what stands there overlap by as much.
+        """
         wider = dataclasses.replace(
             box, x0=box.x0 - margin, y0=box.y0 - margin, x1=box.x1 + margin, y1=box.y1 + margin
         )
         return not any(wider.meets(other) for other in self.taken)
 
-    def away(self, x: float, y: float) -> float:
-        """Metres to the camera's usual place, which is (0, 0); what is behind it counts as far."""
+    def distance_to_camera(self, x: float, y: float) -> float:
+        """Metres from a point to the camera's usual place (0, 0); three times that behind it.
+
+        The camera looks towards +y and stands up to 3 m before or behind its usual place, so that
+        things with y < −4 m are behind it.
+        """
         distance = math.hypot(x, y)
         return distance if y > -4 else 3 * distance
 
@@ -85,32 +104,35 @@ class Scene:
         *,
         scale: float = 1.0,
         margin: float = 0.05,
-        keep: float = 1.0,
+        kept_share: float = 1.0,
         painted: bool = False,
         solid: bool = True,
     ) -> bool:
-        """One of the models at a place, if it is free; returns whether it was.
+        """Add one of the models at a place if the place is free; returns whether it was added.
 
         Args:
-            models: one of these.
-            x, y, z: of its middle, and of its lower side.
-            angle: degrees; at 0 it looks towards −y.
-            scale: of its size.
-            margin: free space to other things.
-            keep: share of its leaves that stay; see `thinned`.
-            painted: whether it gets another colour, as cars do.
-            solid: whether it takes its place from others; crowns of trees do not.
+            models: one of these is chosen; nothing is added if there are none.
+            x, y: of its middle in metres.
+            z: of its lower side.
+            angle: degrees, counterclockwise from above; at 0 it looks towards −y.
+            scale: factor of its size.
+            margin: free space to other things in metres; negative: how far it may reach into them.
+            kept_share: share of its small triangles that stay, such as leaves; see `thinned`.
+            painted: whether it gets another colour, as cars do; see `repainted`.
+            solid: whether nothing else may stand in the box around it. If not, as with trees, whose
+                crowns are above, only half a metre around its middle is taken.
         """
-        # Far from the camera models are simple ones, if there are.
-        limit = TRIANGLES_NEAR / max(1.0, self.away(x, y) / NEAR_M) ** 2
-        simple = [one for one in models if one.triangles * keep <= limit]
+        # Far from the camera only models with few triangles come into question. If none has few
+        # enough, the two with the fewest do.
+        limit = TRIANGLES_NEAR / max(1.0, self.distance_to_camera(x, y) / NEAR_M) ** 2
+        simple = [one for one in models if one.triangles * kept_share <= limit]
         if not simple:
             simple = sorted(models, key=lambda one: one.triangles)[:2]
         if not simple:
             return False
-        models = simple
-        model = models[int(self.rng.integers(len(models)))]
+        model = simple[int(self.rng.integers(len(simple)))]
         width, depth, height = (side * scale for side in model.entry.size_m)
+        # Half the sides of the box around the turned model, which lie along x and y.
         turn = math.radians(angle)
         half_x = (abs(math.cos(turn)) * width + abs(math.sin(turn)) * depth) / 2
         half_y = (abs(math.sin(turn)) * width + abs(math.cos(turn)) * depth) / 2
@@ -121,8 +143,8 @@ class Scene:
             return False
         self.taken.append(region)
         mesh = self.library.mesh(model)
-        if keep < 1:
-            mesh = thinned(mesh, keep, int(self.rng.integers(1 << 30)))
+        if kept_share < 1:
+            mesh = thinned(mesh, kept_share, int(self.rng.integers(1 << 30)))
         if painted:
             mesh = repainted(self.rng, mesh)
         self.parts.append(mesh.moved(rotation_z(angle) * scale, (x, y, z)))
@@ -132,31 +154,37 @@ class Scene:
 
 @functools.lru_cache(4)
 def _by_name(library: Library) -> dict[str, list[Model]]:
-    """The models of a library by the part of their key after the mark."""
+    """The models of a library by the part of their key after the mark #."""
     table: dict[str, list[Model]] = {}
     for model in library.models:
         table.setdefault(model.entry.key.split("#")[-1], []).append(model)
     return table
 
 
-def thinned(mesh: Mesh, keep: float, seed: int) -> Mesh:
-    """A far tree: a random share of its small triangles, enlarged to cover as much as before.
+def thinned(mesh: Mesh, kept_share: float, seed: int) -> Mesh:
+    """The model of a tree with fewer leaves, for far away: a random share of its small triangles.
 
-    The method is that of Cook et al., Stochastic Simplification of Aggregate Detail (2007).
-    Triangles larger than four times the median, as those of a trunk, all stay.
+    Those that stay are enlarged, so that they cover as much as all did before. Triangles larger
+    than four times the median, as those of a trunk, all stay as they are. The method is that of
+    Cook et al., Stochastic Simplification of Aggregate Detail (2007).
+
+    Args:
+        mesh: the model.
+        kept_share: share of the small triangles that stay, above 0 to 1.
+        seed: decides which.
     """
-    sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    small = area < 4 * np.median(area)
+    areas = _double_areas(mesh)
+    small = areas < 4 * np.median(areas)
     # Neighbours in the file are often of one leaf, so groups of four stay or go together.
     group = np.arange(mesh.count) // 4
-    stays = np.random.default_rng(seed).random(mesh.count // 4 + 1)[group] < keep
-    chosen = np.flatnonzero(stays | ~small)
+    group_stays = np.random.default_rng(seed).random(mesh.count // 4 + 1) < kept_share
+    chosen = np.flatnonzero(group_stays[group] | ~small)
     corners = mesh.corners[chosen]
     middle = corners.mean(1, keepdims=True)
-    factor = np.where(small[chosen], keep**-0.5, 1.0)[:, None, None]
+    # The root, because areas grow with the square of lengths.
+    enlargement = np.where(small[chosen], kept_share**-0.5, 1.0)[:, None, None]
     return Mesh(
-        (middle + (corners - middle) * factor).astype(np.float32),
+        (middle + (corners - middle) * enlargement).astype(np.float32),
         mesh.normals[chosen],
         mesh.uv[chosen],
         mesh.material[chosen],
@@ -164,32 +192,40 @@ def thinned(mesh: Mesh, keep: float, seed: int) -> Mesh:
     )
 
 
-def repainted(rng: Rng, mesh: Mesh) -> Mesh:
-    """A car in another colour: its largest material without a picture gets a glossy paint."""
+def _double_areas(mesh: Mesh) -> NDArray[np.float32]:
+    """[F] twice the area of each triangle in m²."""
     sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    total = np.bincount(mesh.material, area, minlength=len(mesh.materials))
-    plain = [
+    return np.asarray(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1))
+
+
+def repainted(rng: Rng, mesh: Mesh) -> Mesh:
+    """The model of a car in another random colour, with glossy paint.
+
+    The paint is on the material with the largest area, and on all of its colour. Materials with a
+    picture, transparent ones (glass) and dark ones (tyres) are left as they are; if a model has no
+    others, so is the model.
+    """
+    areas = np.bincount(mesh.material, _double_areas(mesh), minlength=len(mesh.materials))
+    can_be_sheet_metal = [
         one.texture is None and one.opacity > 0.9 and max(one.color) > 0.12
         for one in mesh.materials
     ]
-    total = np.where(plain, total, 0.0)
-    if not total.any():
+    areas = np.where(can_be_sheet_metal, areas, 0.0)
+    if not areas.any():
         return mesh
-    body = mesh.materials[int(total.argmax())]
+    body = mesh.materials[int(areas.argmax())]
     red, green, blue = CAR_PAINTS[int(rng.integers(len(CAR_PAINTS)))]
-    # Parts of the same colour are of the same sheet metal.
-    skins = [
+    materials = [
         dataclasses.replace(one, color=(red, green, blue), specular=0.05, roughness=0.06)
         if one.texture is None and np.allclose(one.color, body.color, atol=0.02)
         else one
         for one in mesh.materials
     ]
-    return mesh.with_materials(skins)
+    return mesh.with_materials(materials)
 
 
 def daylight(rng: Rng) -> Lights:
-    """Sun and sky of a random hour: clear in most cases, grey, or low and warm in others."""
+    """Sun, sky and haze of a random hour, and no lamps; in 18 % of cases clouds hide the sun."""
     azimuth = rng.uniform(0, 2 * math.pi)
     elevation = math.radians(rng.uniform(14, 62))
     sun = np.array(
@@ -202,12 +238,14 @@ def daylight(rng: Rng) -> Lights:
     )
     overcast = rng.random() < 0.18
     sky = open_sky(rng, sun, overcast)
-    # Irradiance of the sun, in units in which a white sky gives π; 0: behind clouds.
+    # The sun's colour, from nearly white to orange.
     warm = np.array([1.0, 0.9, 0.75]) ** rng.uniform(0.3, 1.6)
+    # Irradiance of the sun, in units in which a white sky gives π; 0: behind clouds. A low sun is
+    # weaker, because its light comes through more air.
     strength = 0.0 if overcast else rng.uniform(6, 15) * math.sin(elevation) ** 0.3
-    # Haze has the colour of the sky a little above the horizon.
-    height = sky.shape[0]
-    horizon = sky[int(0.42 * height) : int(0.47 * height)].mean((0, 1))
+    # Haze has the colour of the sky 5 to 14 degrees above the horizon, which is at half its height.
+    height_px = sky.shape[0]
+    horizon = sky[int(0.42 * height_px) : int(0.47 * height_px)].mean((0, 1))
     return Lights(
         sky=sky,
         sun_direction=sun,
@@ -217,13 +255,16 @@ def daylight(rng: Rng) -> Lights:
         lamp_positions=np.zeros((0, 3), np.float32),
         lamp_radii=np.zeros(0, np.float32),
         lamp_colors=np.zeros((0, 3), np.float32),
-        haze_m=float(1500 * 10 ** rng.uniform(0, 0.8)),
+        haze_m=float(1500 * 10 ** rng.uniform(0, 0.8)),  # 1.5 to 9.5 km
         haze_color=horizon.astype(np.float32),
     )
 
 
 def open_sky(rng: Rng, sun: NDArray[np.float32], overcast: bool) -> NDArray[np.float32]:
-    """[h, w, 3] a sky with clouds that get smaller towards the horizon, and far woods below.
+    """[h, w, 3] a sky's linear radiance: clouds, haze around the sun, woods at the horizon, ground.
+
+    A white surface under a white sky has 1. Pixels are those of `lights.sky_directions`; [h, w] is
+    `lights.SKY_SHAPE`. The lower half is what is seen where nothing else is: the ground.
 
     Args:
         rng: for all random choices.
@@ -231,52 +272,57 @@ def open_sky(rng: Rng, sun: NDArray[np.float32], overcast: bool) -> NDArray[np.f
         overcast: whether clouds cover all of it.
     """
     directions = sky_directions(SKY_SHAPE)
-    up = directions[..., 2]
+    up = directions[..., 2]  # [h, w] sine of the elevation
     zenith = np.array([0.16, 0.33, 0.8]) * rng.uniform(0.6, 1.0)
     horizon = np.array([0.72, 0.84, 1.0]) * rng.uniform(0.7, 1.0)
-    rise = np.clip(up, 0, 1)[..., None]
-    sky = horizon + (zenith - horizon) * rise**0.45
-    glow = np.clip((directions * sun).sum(-1, keepdims=True), 0, 1)
-    sky = sky + (0.5 * glow**6 + 1.5 * glow**80) * np.array([1.0, 0.9, 0.75])
+    height_share = np.clip(up, 0, 1)[..., None]
+    sky = horizon + (zenith - horizon) * height_share**0.45
+    # The air around the sun shines: broadly (power 6), and close to it (power 80).
+    sun_cosine = np.clip((directions * sun).sum(-1, keepdims=True), 0, 1)
+    sky = sky + (0.5 * sun_cosine**6 + 1.5 * sun_cosine**80) * np.array([1.0, 0.9, 0.75])
 
-    # Clouds lie on a plane: seen at a low angle they are far away, small and flat.
+    # Clouds lie on a plane, of which a ray meets the point (x, y) / up: low clouds are far, small
+    # and flat. 0.08 is added to `up`, so that the horizon is not infinitely far.
     noise = cloud_noise(rng, (CLOUD_SIDE, CLOUD_SIDE), 5, 7)
     scale = CLOUD_SIDE * rng.uniform(0.05, 0.12) / (np.clip(up, 0, 1) + 0.08)
     rows = (directions[..., 1] * scale).astype(np.int64) % CLOUD_SIDE
     columns = (directions[..., 0] * scale).astype(np.int64) % CLOUD_SIDE
+    # The noise has a deviation of 1: above a limit of −2.8 it is nearly everywhere.
     density = noise[rows, columns] - (-2.8 if overcast else rng.uniform(0.0, 1.6))
     cover = (np.clip(density * 1.4, 0, 1) * np.clip(up * 7, 0, 1))[..., None]
     # Thick parts are darker below; those near the sun shine.
-    depth = 0.12 * (density - 2.8) if overcast else 0.3 * np.clip(density, 0, 2.2)
-    shade = 1.15 - depth[..., None] + 0.8 * glow**12
-    white = np.array([1.0, 1.0, 1.02]) * shade * (0.75 if overcast else 1.0)
-    sky = sky + (white - sky) * cover
+    darkening = 0.12 * (density - 2.8) if overcast else 0.3 * np.clip(density, 0, 2.2)
+    brightness = 1.15 - darkening[..., None] + 0.8 * sun_cosine**12
+    clouds = np.array([1.0, 1.0, 1.02]) * brightness * (0.75 if overcast else 1.0)
+    sky = sky + (clouds - sky) * cover
 
-    # Woods at the horizon, pale with distance, and the ground below them.
-    edge = 0.012 + 0.012 * np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), 60))
+    # Woods at the horizon, 0.7 degrees (0.012) high and more, and the ground below them; both are
+    # pale, as they are far away.
+    wood_top = 0.012 + 0.012 * np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), 60))
     wood = np.array([0.1, 0.14, 0.07]) * rng.uniform(0.7, 1.3)
-    pale = rng.uniform(0.25, 0.6)
-    wood = wood * (1 - pale) + pale * 0.6 * horizon
-    grain = 1 + 0.2 * cloud_noise(rng, SKY_SHAPE, 120, 3)[..., None]
-    ground = np.array([0.2, 0.22, 0.13]) * (1 - 0.3 * pale) + 0.15 * pale
-    land = np.where(up[..., None] < -0.01, ground, wood * grain)
-    sky = np.where((up < edge)[..., None], land, sky)
+    paleness = rng.uniform(0.25, 0.6)
+    wood = wood * (1 - paleness) + paleness * 0.6 * horizon
+    treetops = 1 + 0.2 * cloud_noise(rng, SKY_SHAPE, 120, 3)[..., None]
+    ground = np.array([0.2, 0.22, 0.13]) * (1 - 0.3 * paleness) + 0.15 * paleness
+    land = np.where(up[..., None] < -0.01, ground, wood * treetops)
+    sky = np.where((up < wood_top)[..., None], land, sky)
     return np.asarray(np.maximum(sky, 0.01), np.float32)
 
 
 def held_camera(
     rng: Rng, eye: Sequence[float], azimuth: float, height: int, width: int, pitch: float = -0.03
 ) -> Viewpoint:
-    """A camera at a point [3], held a little crooked, with 24 to 70 mm.
+    """A camera in a hand: a little crooked, with a focal length of 24 to 70 mm.
 
     Args:
         rng: for focal length, tilt and roll.
-        eye: metres.
-        azimuth: of the direction in which it looks, in radians.
-        height, width: of the picture.
-        pitch: mean tilt upwards in radians.
+        eye: [3] where it is, in metres.
+        azimuth: of the direction in which it looks, in radians: 0 is +x, π / 2 is +y.
+        height, width: of the picture in pixels.
+        pitch: mean tilt upwards in radians; people hold a camera a little downwards.
     """
-    # Phones have 24 to 28 mm. The exponent makes short ones more frequent.
+    # As of a picture on 35 mm film. Phones have 24 to 28 mm; the exponent makes short ones more
+    # frequent.
     focal_mm = 24 * (70 / 24) ** (rng.random() ** 1.8)
     camera = Camera.from_focal(focal_mm_to_px(focal_mm, width, height), width, height)
     tilt = float(np.clip(rng.normal(pitch, 0.06), -0.3, 0.2))
@@ -285,14 +331,21 @@ def held_camera(
 
 
 def eye_height(rng: Rng) -> float:
-    """Metres above the ground: standing in most cases, sometimes stooping."""
+    """Metres of a camera above the ground: of one who stands in 80 %, of one who stoops in 20 %."""
     return float(rng.uniform(1.35, 1.75) if rng.random() < 0.8 else rng.uniform(0.6, 1.3))
 
 
-DrawViewpoint = Callable[[Rng, int, int], Viewpoint]  # by height and width of the picture
+# Draws a random camera: called with a generator, and the picture's height and width in pixels.
+DrawViewpoint = Callable[[Rng, int, int], Viewpoint]
 
 
 def plain(color: Sequence[float], specular: float = 0.0, roughness: float = 1.0) -> Material:
-    """A material of one colour."""
+    """A material of one sRGB colour [3] without a picture.
+
+    Args:
+        color: 0 to 1.
+        specular: share of light that is mirrored when looked at straight on.
+        roughness: 0: a mirror, 1: chalk.
+    """
     red, green, blue = color
     return Material((float(red), float(green), float(blue)), None, specular, roughness)

@@ -14,12 +14,18 @@ from worlds.outdoors import DrawViewpoint
 
 @dataclasses.dataclass(frozen=True)
 class OpenPlan:
-    """A street, garden or track."""
+    """A street, garden or track: its triangles, its light, and from where it is photographed.
 
-    kind: str
-    mesh: Mesh
-    pictures: dict[str, NDArray[np.uint8]]  # made textures by name
+    Coordinates are metres with z up.
+    """
+
+    kind: str  # "town street", "suburban street", "garden" or "track"; told in the world's JSON
+    mesh: Mesh  # all triangles, with their materials
+    # Textures that are no files, [H, W, 3] or [H, W, 4], by the name that materials give.
+    pictures: dict[str, NDArray[np.uint8]]
     lights: Lights
-    draw_viewpoint: DrawViewpoint  # gives a random camera
-    models: tuple[str, ...]  # keys of the models in it, for attribution
-    coarse_m: float  # width of the coarse cells of light in metres
+    draw_viewpoint: DrawViewpoint  # called for a random camera; see its definition
+    models: tuple[str, ...]  # sorted keys of the library's models in it, for attribution
+    # Width in metres of the larger of the two sizes of cells in which `irradiance.solve` keeps
+    # light: smaller ones show finer shadows and take longer.
+    coarse_m: float
