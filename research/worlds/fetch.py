@@ -41,7 +41,12 @@ def fetch(folder: Path) -> None:
 
 
 def download(packages: Sequence[str], archives: Path, root: Path) -> None:
-    """Download Debian's packages into a folder of archives, and unpack them into another folder.
+    """Download packages of Debian and unpack them, without installing anything.
+
+    Args:
+        packages: their names.
+        archives: the folder for their files (.deb); all files there are unpacked.
+        root: the folder to unpack into; it becomes their root folder, with "usr" in it.
 
     Raises:
         InputError: apt-get or dpkg is missing or fails.

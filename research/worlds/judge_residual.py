@@ -3,9 +3,13 @@
     PYTHONPATH=src:research python -m worlds.judge_residual WEIGHTS... --pairs PAIRS \\
         --worlds WORLDS --features squeezenet_v1.0.npz [--sheet sheet.png]
 
-Each view is completed by itself, as the method `spackle` of `spackle evaluate`; --alone leaves out
-the texture from patches. PSNR and distance (`spackle.paper.training.losses.hole_distance`) are
-measured in the hole. WEIGHTS "shipped" are the package's, and "initial" does without a network.
+A photo is lifted to Gaussians, the base, and rendered at a second camera; the true photo from there
+tells what belongs in the holes. Each view is completed by itself, as the method `spackle` of
+`spackle evaluate` does it: a residual network completes smooth colours, and texture is copied from
+patches elsewhere in the view; --alone leaves out this copying. PSNR and distance
+(`spackle.paper.training.losses.hole_distance`) are measured in the hole. WEIGHTS are files,
+"shipped" for the package's own, or "initial" for a completion without a network. The first ones are
+those that all are compared with.
 """
 
 from __future__ import annotations
@@ -34,22 +38,44 @@ from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError
 from spackle.scene_fill import FillContext, fill_view
 from spackle.scene_fill.texture import exemplar_texture
-from worlds.second_views import BASES, as_colors, base_of_world, second_view
+from worlds.second_views import DEPTH_KINDS, PHOTO_VIEW, as_colors, base_of_world, is_usable
 from worlds.shards import read_view, world_keys
 
-WORLDS_OF_ARCHIVE = 3  # one for each depth by which photos are lifted
+# The numbers of the second views of a world that are judged: two of six, numbered from 1.
 JUDGED_VIEWS = (1, 4)
-MIN_HOLE = 0.01  # share of a view; the figures of fewer pixels would count as much as all others
+# Least share of a view that its hole has: figures of a few pixels would count as much as others.
+MIN_HOLE = 0.01
 SHEET_SIDE_PX = 448  # longer side of a picture on the sheet
 
 
 class JudgedView(NamedTuple):
     """A view to complete, and what it should show."""
 
-    group: str
-    base: BasePrediction
-    camera: Camera
-    truth: Tensor  # [H, W, 3] sRGB
+    group: str  # views of one group share rows of the table, such as "pairs"
+    base: BasePrediction  # the Gaussians of a photo
+    camera: Camera  # beside the photo's: what it sees of the base has holes
+    truth: Tensor  # [H, W, 3] sRGB, the true photo from there
+
+
+class HoleFigures(NamedTuple):
+    """How well a completed view shows the truth in its hole."""
+
+    psnr: float  # dB, higher is better
+    distance: float  # of SqueezeNet's features, lower is better
+
+
+class Completion(NamedTuple):
+    """A completed view."""
+
+    rgb: Tensor  # [H, W, 3] sRGB
+    hole: Tensor  # [H, W] bool, the pixels that were completed
+
+
+class Judgement(NamedTuple):
+    """What `judge` finds. Views with a hole below `MIN_HOLE` are in neither part."""
+
+    figures: dict[str, list[list[HoleFigures]]]  # by group: for each view, for each network
+    pictures: list[list[Tensor]]  # for each view: the base's rendering, completed views, the truth
 
 
 def views_of_pairs(folder: Path) -> Iterator[JudgedView]:
@@ -61,38 +87,51 @@ def views_of_pairs(folder: Path) -> Iterator[JudgedView]:
 
 
 def views_of_worlds(folder: Path) -> Iterator[JudgedView]:
-    """Second views of the first worlds of all archives in a folder; each world has another base."""
+    """Second views of the first worlds of all archives of rooms in a folder.
+
+    Of each archive the first world's photo is lifted by its true depth, the second's by true depth
+    with wrong outlines, the third's by the depth that `lite` guesses (`DEPTH_KINDS`); each kind is
+    a group of its own.
+    """
     renderer = get_renderer()
     for archive in sorted(folder.glob("worlds-*.tar")):
-        worlds = world_keys(archive)[:WORLDS_OF_ARCHIVE]
-        for number, (key, kind) in enumerate(zip(worlds, BASES, strict=False)):
+        # One world for each kind; an archive may have fewer worlds than there are kinds.
+        for number, (key, kind) in enumerate(zip(world_keys(archive), DEPTH_KINDS, strict=False)):
             try:
-                photo = read_view(archive, key, 0)
+                photo = read_view(archive, key, PHOTO_VIEW)
                 base = base_of_world(photo, kind, np.random.default_rng(number))
-            except ValueError as error:  # a guess that takes near for far
+            except ValueError as error:  # in most cases: `lite` guesses that near things are far
                 print(f"{archive.name} {key}: left out: {error}", file=sys.stderr)
                 continue
-            for view in JUDGED_VIEWS:
-                truth = read_view(archive, key, view)
-                try:
-                    second_view(base, truth, renderer)
-                except ValueError:  # no hole, or a base that does not fit
-                    continue
-                yield JudgedView(f"worlds, {kind}", base, truth.camera, as_colors(truth.rgb))
+            for view_number in JUDGED_VIEWS:
+                true_view = read_view(archive, key, view_number)
+                if is_usable(base, true_view, renderer):
+                    truth = as_colors(true_view.rgb)
+                    yield JudgedView(f"worlds, {kind}", base, true_view.camera, truth)
 
 
 @torch.no_grad()
-def completed(view: JudgedView, network: ResidualNet | None, alone: bool) -> tuple[Tensor, Tensor]:
-    """The completed view [H, W, 3] sRGB, and its hole [H, W] bool before."""
+def completed(view: JudgedView, network: ResidualNet | None, alone: bool) -> Completion:
+    """The completed view, and the hole that it had before.
+
+    Args:
+        view: what to complete.
+        network: completes smooth colours; None: they are completed without a network.
+        alone: whether texture from patches is left out, so that the network is seen alone.
+    """
     context = FillContext.of(
         view.base, get_renderer(), network, texture=None if alone else exemplar_texture
     )
     hole = hole_mask(context.renderer.render(context.base, view.camera).alpha)
-    return fill_view(context, view.camera).rendering.rgb, hole
+    return Completion(fill_view(context, view.camera).rendering.rgb, hole)
 
 
 def open_network(name: str) -> ResidualNet | None:
-    """The network of a file; InputError if it has no weights of the residual."""
+    """The network of a file or of the name "shipped"; None, no network, for "initial".
+
+    Raises:
+        InputError: the file has no weights of the residual.
+    """
     if name == "initial":
         return None
     return load_residual(SHIPPED if name == "shipped" else Path(name))
@@ -103,46 +142,87 @@ def judge(
     networks: Sequence[ResidualNet | None],
     features: FeatureNet,
     alone: bool,
-) -> tuple[dict[str, list[list[tuple[float, float]]]], list[list[Tensor]]]:
-    """PSNR and distance in the holes, by group, for each view and network; and pictures.
+) -> Judgement:
+    """Figures and pictures of each view, completed by each network.
 
-    The pictures of a view are the base's rendering, the completed views, and the truth.
+    Args:
+        views: what to complete, and the truth.
+        networks: of the residual; None: completes without a network.
+        features: SqueezeNet's, by which distances are measured.
+        alone: whether texture from patches is left out.
     """
-    figures: dict[str, list[list[tuple[float, float]]]] = {}
+    figures: dict[str, list[list[HoleFigures]]] = {}
     pictures = []
     for view in views:
-        row: list[tuple[float, float]] = []
+        view_figures: list[HoleFigures] = []
         rendering = get_renderer().render(view.base.gaussians, view.camera).rgb
         shown = [rendering]
         for network in networks:
             rgb, hole = completed(view, network, alone)
+            # All networks fill the same hole, so the first one decides for all.
             if float(hole.float().mean()) < MIN_HOLE:
                 break
+            psnr = hole_psnr(rgb, view.truth, hole)
             distance = hole_distance(features, rgb, view.truth, hole)
-            row.append((hole_psnr(rgb, view.truth, hole), distance))
+            view_figures.append(HoleFigures(psnr, distance))
             shown.append(rgb)
-        if row:
-            figures.setdefault(view.group, []).append(row)
+        if view_figures:
+            figures.setdefault(view.group, []).append(view_figures)
             pictures.append([*shown, view.truth])
-    return figures, pictures
+    return Judgement(figures, pictures)
+
+
+def print_table(figures: dict[str, list[list[HoleFigures]]], names: Sequence[str]) -> None:
+    """Print a Markdown table with a row for each group of views and each network.
+
+    Its last column tells in how many views a network has less distance than the first network.
+
+    Args:
+        figures: by group: for each view, for each network.
+        names: the networks', in the same order.
+    """
+    print(f"| | weights | distance | PSNR in the hole | views with less distance than {names[0]} |")
+    print("|---|---|---|---|---|")
+    for group, views in figures.items():
+        psnr = np.array([[one.psnr for one in view] for view in views])  # [views, networks]
+        distance = np.array([[one.distance for one in view] for view in views])
+        is_less = distance < distance[:, :1]
+        for index, name in enumerate(names):
+            means = f"{distance[:, index].mean():.4f} | {psnr[:, index].mean():.3f}"
+            print(f"| {group} | {name} | {means} | {is_less[:, index].sum()} of {len(views)} |")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status."""
+    """Judge weights and print a table of them; returns the exit status: 0, or 2 for bad input."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("weights", nargs="+", help="files, shipped or initial")
-    parser.add_argument("--pairs", type=Path, help="a folder of scenes, each with a scene.json")
-    parser.add_argument("--worlds", type=Path, help="a folder of archives worlds-NNNNN.tar")
+    parser.add_argument(
+        "weights",
+        nargs="+",
+        help="files with weights of the residual; shipped: the package's; initial: no network. "
+        "The first are those that the others are compared with",
+    )
+    parser.add_argument(
+        "--pairs", type=Path, help="a folder of stereo pairs, each a folder with a scene.json"
+    )
+    parser.add_argument(
+        "--worlds", type=Path, help="a folder of archives of made rooms, worlds-NNNNN.tar"
+    )
     parser.add_argument("--features", type=Path, required=True, help="SqueezeNet 1.0's weights")
-    parser.add_argument("--alone", action="store_true", help="without texture from patches")
-    parser.add_argument("--sheet", type=Path, help="a file for the pictures")
+    parser.add_argument(
+        "--alone",
+        action="store_true",
+        help="copy no texture from elsewhere into holes",
+    )
+    parser.add_argument(
+        "--sheet", type=Path, help="a PNG file: each view incomplete, completed by all, and true"
+    )
     options = parser.parse_args(arguments)
     try:
         networks = [open_network(name) for name in options.weights]
         features = load_features("squeezenet", options.features)
-        assert features is not None
+        assert features is not None  # None is only for the name "none"
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -152,15 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.worlds:
         views += views_of_worlds(options.worlds)
     figures, pictures = judge(views, networks, features, options.alone)
-
-    print("| | weights | distance | PSNR in the hole | views with less distance |")
-    print("|---|---|---|---|---|")
-    for group, rows in figures.items():
-        values = np.array(rows)  # [views, weights, 2]
-        for index, name in enumerate(options.weights):
-            psnr, distance = values[:, index].mean(0)
-            fewer = int((values[:, index, 1] < values[:, 0, 1]).sum())
-            print(f"| {group} | {name} | {distance:.4f} | {psnr:.3f} | {fewer} of {len(rows)} |")
+    print_table(figures, options.weights)
     if options.sheet:
         save_png(contact_sheet(pictures, SHEET_SIDE_PX), options.sheet)
     return 0

@@ -1,4 +1,8 @@
-"""All models of the catalogues on disk as arrays, read once and then fast to load."""
+"""All models of catalogues on disk as arrays, read once and then fast to load.
+
+A library is a folder: an NPZ file for each model, PNG files of their pictures, and an index. There
+are two: that of the catalogues of furniture, houses and plants, and that of `worlds.torcs`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -20,17 +25,26 @@ from worlds.meshes import Material, Mesh
 INDEX_FILE = "index.json"
 LIBRARY_VERSION = 2  # increases whenever the same catalogues would give other arrays
 MAX_TEXTURE_PX = 1024  # a larger picture is shrunk
-ReadPicture = Callable[[str], tuple[str, bytes] | None]  # the full name and content, by a name
 KEPT_MODELS = 400  # in memory; a model has 2 MB on average
+
+
+class NamedPicture(NamedTuple):
+    """A picture's file, as a catalogue has it."""
+
+    name: str  # identifies the picture among all that a library gets
+    content: bytes
+
+
+ReadPicture = Callable[[str], NamedPicture | None]  # by the name in a model; None: it is missing
 
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A catalogue's model: what it is, and its number of triangles."""
+    """A catalogue's model: what it is, and where its triangles are."""
 
     entry: Entry
-    triangles: int
-    file: str  # below the library's folder
+    triangles: int  # their number
+    file: str  # of the mesh, below the library's folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +67,12 @@ class Library:
 
     @staticmethod
     def write(folder: Path, models: list[Model]) -> Library:
-        """A library of models whose arrays are in `folder`; writes its index."""
+        """Write the index of a library; returns the library.
+
+        Args:
+            folder: has the models' files already.
+            models: all of them.
+        """
         content = [dataclasses.asdict(model) for model in models]
         write_json({"version": LIBRARY_VERSION, "models": content}, folder / INDEX_FILE)
         return Library(folder, tuple(models))
@@ -62,7 +81,11 @@ class Library:
     def open(folder: Path, catalogues: list[Path], log: Callable[[str], None]) -> Library:
         """The library in `folder`, which is made from catalogue files if it is not there yet.
 
-        Models that cannot be read are left out and reported to `log`.
+        Args:
+            folder: of the library; it is made if it is missing.
+            catalogues: files of Sweet Home 3D (.sh3f), each with many models.
+            log: called with a line for each catalogue, and for each model or picture that cannot
+                be read and is left out.
         """
         found = Library.read(folder)
         if found is not None:
@@ -71,32 +94,42 @@ class Library:
         models = []
         for path in catalogues:
             log(f"reading {path.name}")
-            models += _convert(path, folder, log)
+            models += _convert_catalogue(path, folder, log)
         return Library.write(folder, models)
 
     def mesh(self, model: Model) -> Mesh:
-        """The triangles of a model; see `catalogue.read_model` for how it stands."""
+        """The triangles of a model in metres, z up, its front towards −y.
+
+        Furniture stands on z = 0 with its box's middle at x = y = 0. Cars stand on z = 0, too.
+        Tracks lie as their files say.
+        """
         return _load_mesh(self.folder / model.file)
 
 
 def _model(facts: dict[str, object]) -> Model:
-    """A model from the index."""
+    """A model from its facts in the index, which are JSON: there tuples are lists."""
     entry = dict(facts["entry"])  # type: ignore[call-overload]
     entry["size_m"] = tuple(entry["size_m"])
     entry["turn"] = None if entry["turn"] is None else tuple(entry["turn"])
     return Model(Entry(**entry), int(str(facts["triangles"])), str(facts["file"]))
 
 
-def _convert(path: Path, folder: Path, log: Callable[[str], None]) -> list[Model]:
-    """Write the models and pictures of a catalogue; returns what could be read."""
+def _convert_catalogue(path: Path, folder: Path, log: Callable[[str], None]) -> list[Model]:
+    """Write a catalogue's models and pictures into a library; returns the models that were read.
+
+    Args:
+        path: the catalogue, a ZIP archive (.sh3f).
+        folder: of the library.
+        log: called with a line for each model or picture that cannot be read and is left out.
+    """
     models = []
     with zipfile.ZipFile(path) as archive:
         names = {name.lower(): name for name in archive.namelist()}
 
-        def read(picture: str) -> tuple[str, bytes] | None:
-            """The name and content of a picture in the catalogue, in any case of letters."""
+        def read(picture: str) -> NamedPicture | None:
+            """A picture of the catalogue by its name, in any case of letters; None if missing."""
             name = names.get(picture.lower())
-            return None if name is None else (name, archive.read(name))
+            return None if name is None else NamedPicture(name, archive.read(name))
 
         for entry in read_catalogue(path):
             try:
@@ -117,12 +150,14 @@ def with_picture(
     folder: Path,
     log: Callable[[str], None],
 ) -> Material:
-    """The material with its picture's file in the library; without a picture if it is missing.
+    """The material with a file of the library as its texture; the file is written if it is missing.
+
+    A texture that cannot be read becomes None: the material then has one colour.
 
     Args:
         material: its texture is a name that `read` knows.
-        read: gives the picture's full name and its content; None if it is missing.
-        folder: the library's.
+        read: gives the picture, or None if it is missing.
+        folder: the library's; textures are names of files in it.
         log: called with a line for each picture that is missing or broken.
     """
     if material.texture is None:
@@ -138,7 +173,7 @@ def with_picture(
         try:
             picture: Image.Image = Image.open(io.BytesIO(content))
             picture.load()
-        except (OSError, ValueError) as error:  # Pillow says ValueError of rare SGI files
+        except (OSError, ValueError) as error:  # Pillow raises ValueError for some SGI files
             log(f"broken picture: {material.texture}: {error}")
             return dataclasses.replace(material, texture=None)
         has_alpha = "A" in picture.getbands() or "transparency" in picture.info
@@ -150,12 +185,18 @@ def with_picture(
 
 
 def save_mesh(mesh: Mesh, path: Path) -> None:
-    """Write a mesh as arrays; its materials as JSON among them."""
+    """Write a mesh to an NPZ file; its materials are bytes of JSON among the arrays.
+
+    Args:
+        mesh: textures are names of files in the folder of `path`.
+        path: ends in .npz.
+    """
     materials = json.dumps([dataclasses.asdict(material) for material in mesh.materials])
     with atomic_path(path) as temporary:
         np.savez(
-            temporary,
+            temporary,  # ends in .npz, too
             corners=mesh.corners,
+            # Unit vectors serve for shading alone, for which three digits are enough.
             normals=mesh.normals.astype(np.float16),
             uv=mesh.uv,
             material=mesh.material,
@@ -165,7 +206,7 @@ def save_mesh(mesh: Mesh, path: Path) -> None:
 
 @functools.lru_cache(KEPT_MODELS)
 def _load_mesh(path: Path) -> Mesh:
-    """Read what `save_mesh` has written; pictures get their full path."""
+    """The mesh that `save_mesh` has written to a file; its textures become full paths."""
     with np.load(path) as arrays:
         facts = json.loads(arrays["materials"].tobytes().decode())
         materials = []

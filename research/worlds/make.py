@@ -3,8 +3,9 @@
     PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 1000 --photos PHOTOS
     PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 500 --kind streets
 
-Archives of streets and gardens are called `streets-`, those of tracks `tracks-`. Tracks are from
-the second set of models, whose terms are not those of the first; see README.md.
+The names of archives with streets and gardens begin with `streets-`, those with tracks with
+`tracks-`. Rooms and streets are made of the first set of models, which `worlds.fetch` gets; tracks
+of the second set, which `worlds.torcs` gets and whose terms are others; see README.md.
 
 A world depends on the seed and its number alone. The command goes on where it was stopped; archives
 that are there are kept. Two processes share the work by `--part 1/2` and `--part 2/2`.
@@ -17,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,16 +53,29 @@ from worlds.views import COARSE_M, VALID, render
 Rng = np.random.Generator
 SIZE = (336, 448)  # height and width of pictures
 UPRIGHT = 0.25  # share of worlds whose photo is upright
-ATTEMPTS = 20  # rooms that may show too little, one after another
-MIN_KNOWN = 0.6  # share of a photo with a known surface
-OPEN_MIN_KNOWN = 0.5  # in the open, where the sky is not a surface
-OPEN_BALANCED = (0.05, 0.45)  # range of the share of a cast that white balance takes away there
-OPEN_NEAR_M = 0.8  # nearer things in the open fill the picture
+ATTEMPTS = 20  # how many rooms or places are tried until one shows enough
+# Least share of a photo whose pixels show a surface that is not behind glass: of rooms; and in the
+# open, where the sky is no surface.
+MIN_KNOWN = 0.6
+OPEN_MIN_KNOWN = 0.5
+# In the open: range of the share of the light's cast that white balance takes away.
+OPEN_BALANCED = (0.05, 0.45)
+OPEN_NEAR_M = 0.8  # in the open: nearer things fill the picture
 VERSION = 2  # increases whenever the same seed gives other rooms
-OPEN_VERSION = 1  # and other streets, gardens and tracks
+OPEN_VERSION = 1  # increases whenever the same seed gives other streets, gardens or tracks
 # How the names of archives begin, by the kind of worlds in them.
 PREFIXES = {"rooms": ROOMS_PREFIX, "streets": "streets", "tracks": "tracks"}
-DrawPlan = Callable[[Rng], OpenPlan]
+DrawPlan = Callable[[Rng], OpenPlan]  # gives a random street, garden or track
+
+
+class PackedWorld(NamedTuple):
+    """A world, ready for an archive."""
+
+    data: bytes  # its files, as part of a tar archive
+    views: int  # how many views it has, the photo's included
+
+
+MakeWorld = Callable[[int], PackedWorld]  # makes the world of a number
 
 
 def photos_of(folder: Path | None) -> DrawPhoto | None:
@@ -91,15 +105,15 @@ def make_world(
     seed: int,
     number: int,
     size: tuple[int, int] = SIZE,
-) -> tuple[bytes, int]:
-    """A packed world, and its number of views.
+) -> PackedWorld:
+    """A furnished room, packed.
 
     Args:
         furniture: models by group.
-        cache: the folder of surfaces.
-        photo: gives photos, or None.
+        cache: the folder in which drawn textures of surfaces are kept.
+        photo: gives photos for picture frames and windows; None: there are none.
         seed, number: determine the world.
-        size: height and width, swapped in upright photos.
+        size: height and width in pixels, swapped in upright photos.
 
     Raises:
         InputError: no room in a row of `ATTEMPTS` shows enough.
@@ -112,9 +126,9 @@ def make_world(
         viewpoint = choose_viewpoint(rng, plan.place, world, height, width)
         if viewpoint is None:
             continue
-        made = _packed(rng, world, viewpoint, plan, seed, number, MIN_KNOWN, COARSE_M)
-        if made is not None:
-            return made
+        packed = _packed_world(rng, world, viewpoint, plan, seed, number, MIN_KNOWN, COARSE_M)
+        if packed is not None:
+            return packed
     raise InputError(f"world {number}: {ATTEMPTS} rooms in a row show too little")
 
 
@@ -124,14 +138,14 @@ def make_open_world(
     seed: int,
     number: int,
     size: tuple[int, int] = SIZE,
-) -> tuple[bytes, int]:
-    """A packed street, garden or track, and its number of views.
+) -> PackedWorld:
+    """A street, garden or track, packed.
 
     Args:
         draw: gives a random one.
-        library: its models, of which the JSON names creators and licences.
+        library: the models it is made of; the world's JSON names their creators and licences.
         seed, number: determine the world.
-        size: height and width, swapped in upright photos.
+        size: height and width in pixels, swapped in upright photos.
 
     Raises:
         InputError: no place in a row of `ATTEMPTS` shows enough.
@@ -153,15 +167,15 @@ def make_open_world(
             "creators": sorted({one.creator for one in used if one.creator}),
             "licences": sorted({one.licence for one in used}),
         }
-        made = _packed(
+        packed = _packed_world(
             rng, world, viewpoint, plan, seed, number, OPEN_MIN_KNOWN, plan.coarse_m, facts
         )
-        if made is not None:
-            return made
+        if packed is not None:
+            return packed
     raise InputError(f"world {number}: {ATTEMPTS} places in a row show too little")
 
 
-def _packed(
+def _packed_world(
     rng: Rng,
     world: World,
     viewpoint: Viewpoint,
@@ -171,23 +185,25 @@ def _packed(
     min_known: float,
     coarse_m: float,
     more_facts: Mapping[str, Any] | None = None,
-) -> tuple[bytes, int] | None:
-    """A packed world and its number of views; None if its photo shows too few surfaces.
+) -> PackedWorld | None:
+    """A world, rendered and packed; None if its photo shows too few surfaces.
 
     Args:
         rng: for second cameras, rays and the photo's settings.
         world: the plan's triangles.
         viewpoint: the photo's camera.
-        plan: what the world consists of.
-        seed, number: of the world; its key.
-        min_known: share of the photo with a known surface.
-        coarse_m: width of the coarse cells of light in metres.
-        more_facts: what else its JSON says.
+        plan: what the world consists of, with its light.
+        seed, number: those that the world is made by; they become its key, such as "00-000012".
+        min_known: least share of the photo that shows surfaces which are not behind glass.
+        coarse_m: width in metres of the coarse cells on which surfaces light each other; see
+            `views.render`.
+        more_facts: what else its JSON says; the version there replaces that of rooms.
     """
     camera = viewpoint.camera
     pixels = pixel_grid(camera.height, camera.width)
     hits = world.first_hits(*viewpoint.rays(camera, pixels))
     known = hits.triangle >= 0
+    # Looked at before rendering, which takes long; what is behind glass is only known after it.
     if known.mean() < min_known:
         return None
     cameras, names = second_cameras(rng, world, viewpoint, hits.distance[known])
@@ -207,26 +223,26 @@ def _packed(
         "trajectories": names,
     } | dict(more_facts or {})
     key = f"{seed:02d}-{number:06d}"
-    return pack_world(key, jpeg, views, settings, facts), len(views)
+    return PackedWorld(pack_world(key, jpeg, views, settings, facts), len(views))
 
 
 def make_shards(
     output: Path,
-    make: Callable[[int], tuple[bytes, int]],
+    make: MakeWorld,
     worlds: int,
     part: tuple[int, int],
     log: Callable[[str], None],
     prefix: str = ROOMS_PREFIX,
 ) -> None:
-    """Write all archives that are missing.
+    """Write all archives of this process's part that are missing.
 
     Args:
         output: their folder.
-        make: gives the packed world of a number, and its number of views.
-        worlds: how many there shall be.
+        make: makes the world of a number; numbers begin at 0.
+        worlds: how many there shall be in all archives together.
         part: this process's part, from 0, and the number of parts.
-        log: called with a line for each archive.
-        prefix: how the archives' names begin.
+        log: called with a line for each archive that was written.
+        prefix: how the archives' names begin, before "-00000.tar".
     """
     make_folder(output)
     shards = -(-worlds // WORLDS_PER_SHARD)
@@ -239,8 +255,8 @@ def make_shards(
         first = shard * WORLDS_PER_SHARD
         numbers = range(first, min(first + WORLDS_PER_SHARD, worlds))
         made = [make(number) for number in numbers]
-        write_shard(path, [data for data, _ in made])
-        views = sum(count for _, count in made)
+        write_shard(path, [world.data for world in made])
+        views = sum(world.views for world in made)
         seconds = time.perf_counter() - begin
         work = time.process_time() - work_begin
         log(
@@ -249,16 +265,16 @@ def make_shards(
         )
 
 
-def _maker(
-    kind: str, cache: Path, photo: DrawPhoto | None, seed: int
-) -> Callable[[int], tuple[bytes, int]]:
-    """What makes the packed world of a number, and its number of views.
+def _maker_of_kind(kind: str, cache: Path, photo: DrawPhoto | None, seed: int) -> MakeWorld:
+    """The function that makes worlds of a kind, each by its number.
+
+    It opens the library of the kind's models, which is fetched first if it is missing.
 
     Args:
         kind: a key of `PREFIXES`.
-        cache: where models and surfaces are kept.
+        cache: the folder in which models and drawn textures are kept.
         photo: gives photos for rooms, or None.
-        seed: determines the worlds, with their numbers.
+        seed: determines the worlds, together with their numbers.
     """
     if kind == "rooms":
         furniture = Furniture(open_library(cache))
@@ -266,7 +282,7 @@ def _maker(
     library = open_torcs(cache) if kind == "tracks" else open_library(cache)
 
     def draw(rng: Rng) -> OpenPlan:
-        """A random place."""
+        """A random track, or a random street or garden."""
         return track(rng, library) if kind == "tracks" else street_or_garden(rng, library, cache)
 
     return lambda number: make_open_world(draw, library, seed, number)
@@ -278,7 +294,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder for archives")
-    parser.add_argument("--kind", choices=sorted(PREFIXES), default="rooms")
+    parser.add_argument(
+        "--kind", choices=sorted(PREFIXES), default="rooms", help="of worlds; streets: and gardens"
+    )
     parser.add_argument("--worlds", type=int, default=48, help="how many there shall be")
     parser.add_argument("--photos", type=Path, help="photos for frames and windows")
     parser.add_argument("--seed", type=int, default=0)
@@ -288,7 +306,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         which, parts = (int(word) for word in options.part.split("/"))
         cache = cache_folder(options.cache)
-        make = _maker(options.kind, cache, photos_of(options.photos), options.seed)
+        make = _maker_of_kind(options.kind, cache, photos_of(options.photos), options.seed)
         make_folder(options.output)
         with file_lock(options.output / f".part-{which}.lock"):
             make_shards(

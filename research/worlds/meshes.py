@@ -256,11 +256,16 @@ def box(
 
 
 class Faces:
-    """Many parallelograms and boxes, which become one mesh at once; see `quad` and `box`."""
+    """Many parallelograms and boxes, which become one mesh at once.
+
+    It takes less time than to join the meshes of the functions `quad` and `box`.
+    """
 
     def __init__(self) -> None:
         """None yet."""
-        # By material: corner, two sides, width and height of a repeat, texture offset.
+        # By material, a row of twelve numbers for each parallelogram: its corner (3), its two sides
+        # (3 each), the width and height of a repeat of the texture in metres (1; 0: one repeat in
+        # all), and what is added to u and v (2).
         self._rows: dict[Material, list[tuple[float, ...]]] = {}
 
     def quad(
@@ -272,7 +277,17 @@ class Faces:
         tile_m: float | None = None,
         uv_offset: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Add a parallelogram as `quad` makes it; `tile_m` is both sides of a repeat."""
+        """Add a parallelogram, which is seen from the side to which `side` × `other` points.
+
+        Args:
+            origin: [3] a corner in metres; u and v are 0 there.
+            side: [3] from there to a neighbouring corner, along u.
+            other: [3] to the other neighbour, along v.
+            material: its surface.
+            tile_m: width and height of one repeat of the texture in metres; None: the texture is
+                there once.
+            uv_offset: added to u and v.
+        """
         size = 0.0 if tile_m is None else tile_m
         row = (*origin, *side, *other, size, *uv_offset)
         self._rows.setdefault(material, []).append(row)
@@ -284,11 +299,19 @@ class Faces:
         material: Material,
         tile_m: float | None = None,
     ) -> None:
-        """Add a box as `box` makes it."""
+        """Add a box with sides along the axes: its six faces, seen from outside.
+
+        Args:
+            low: [3] the smallest coordinates in metres.
+            high: [3] the largest.
+            material: of all faces.
+            tile_m: width and height of one repeat of the texture in metres; None: once a face.
+        """
         x0, y0, z0 = low
         x1, y1, z1 = high
-        x, y, z = x1 - x0, y1 - y0, z1 - z0
+        x, y, z = x1 - x0, y1 - y0, z1 - z0  # lengths
         size = 0.0 if tile_m is None else tile_m
+        # Corner, side along u, side along v, size of a repeat, no offset. The front is at −y.
         self._rows.setdefault(material, []).extend(
             (
                 (x0, y0, z0, x, 0, 0, 0, 0, z, size, 0, 0),  # front
@@ -307,18 +330,24 @@ class Faces:
 
 
 def _parallelograms(rows: NDArray[np.float64], material: Material) -> Mesh:
-    """The mesh of rows [N, 12] of `Faces`, which have one material."""
+    """The mesh of N parallelograms with one material, two triangles each.
+
+    Args:
+        rows: [N, 12] a corner (3), two sides (3 each), width and height of a repeat of the texture
+            (1; 0: one repeat in all), and what is added to u and v (2); lengths in metres.
+        material: of all of them.
+    """
     origin, side, other = rows[:, 0:3], rows[:, 3:6], rows[:, 6:9]
     tile_m, offset = rows[:, 9:10], rows[:, 10:12]
+    # The four corners, around the face, and their texture coordinates.
     points = np.stack([origin, origin + side, origin + side + other, origin + other], 1)
     lengths = np.stack([np.linalg.norm(side, axis=1), np.linalg.norm(other, axis=1)], 1)
-    # One repeat in all where no size is given.
     repeats = np.where(tile_m > 0, lengths / np.where(tile_m > 0, tile_m, 1.0), 1.0)
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
     uv = square * repeats[:, None] + offset[:, None]
     normal = np.cross(side, other)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    order = np.array([[0, 1, 2], [0, 2, 3]])
+    order = np.array([[0, 1, 2], [0, 2, 3]])  # the corners of the two triangles
     count = 2 * len(rows)
     return Mesh(
         points[:, order].reshape(count, 3, 3).astype(np.float32),

@@ -46,27 +46,35 @@ class Surface:
     roughness: float
 
 
-# A surface's picture (None if it is not wanted, because its file is there), the width of one
-# repeat in metres, its specular share and its roughness. These three are drawn first, so that they
-# are the same with and without the picture.
+# A surface's picture, the width of one repeat in metres, the share of light that is mirrored when
+# looked at straight on, and the roughness: 0 for a mirror, 1 for chalk. The picture is None if it
+# is not wanted, because its file is there; the three numbers are drawn before the picture, so that
+# they are the same with and without it.
 Drawn = tuple[Image3 | None, float, float, float]
-Draw = Callable[[Rng, bool], Drawn]
+Draw = Callable[[Rng, bool], Drawn]  # whether the picture is wanted
 
 
 def surfaces(folder: Path, kind: str) -> list[Surface]:
-    """All surfaces of a kind; drawn into `folder` at the first call."""
+    """All surfaces of a kind, a key of `KINDS`; drawn into `folder` at the first call."""
     return drawn_surfaces(folder, kind, KINDS[kind])
 
 
 @functools.lru_cache(64)
 def drawn_surfaces(folder: Path, kind: str, draw: Draw) -> list[Surface]:
-    """The surfaces that `draw` makes; kept in `folder` under the name of their kind."""
+    """PER_KIND random surfaces of a kind; their pictures are drawn if `folder` lacks their files.
+
+    Args:
+        folder: for the pictures, whose names begin with the kind.
+        kind: also the seed, with a surface's number.
+        draw: makes a random surface of the kind.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for number in range(PER_KIND):
         rng = np.random.default_rng([SURFACES_VERSION, zlib.crc32(kind.encode()), number])
         path = folder / f"{kind}-v{SURFACES_VERSION}-{number:02d}.png"
-        picture, tile_m, specular, roughness = draw(rng, not path.is_file())
+        is_picture_wanted = not path.is_file()
+        picture, tile_m, specular, roughness = draw(rng, is_picture_wanted)
         if picture is not None:
             with atomic_path(path) as temporary:
                 Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)).save(

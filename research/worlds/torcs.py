@@ -2,7 +2,8 @@
 
     PYTHONPATH=src:research python -m worlds.torcs
 
-Its terms (GPL 2 or later, Free Art License) ask that what is made of it is shared alike, so it is
+The first set are the catalogues of furniture, houses and plants that `worlds.fetch` gets. The terms
+of this one (GPL 2 or later, Free Art License) ask that what is made of it is shared alike, so it is
 fetched, kept and used apart from the first set, and what is learnt from it is never in weights
 that anyone may use.
 """
@@ -21,15 +22,15 @@ from spackle.runtime.errors import InputError
 from worlds.ac3d_files import read_ac3d
 from worlds.catalogue import Entry
 from worlds.fetch import cache_folder, download
-from worlds.library import Library, Model, ReadPicture, save_mesh, with_picture
+from worlds.library import Library, Model, NamedPicture, ReadPicture, save_mesh, with_picture
 from worlds.meshes import Mesh, joined
 
 PACKAGE = "torcs-data"
-GAME = "usr/share/games/torcs"
+GAME = "usr/share/games/torcs"  # in the unpacked package
 COPYRIGHT = "usr/share/doc/torcs-data/copyright"
 FREE_ART = "Free Art License 1.3"
 GPL = "GPL-2.0-or-later"
-TRACK, CAR = "Tracks", "Cars"  # categories
+TRACK, CAR = "Tracks", "Cars"  # categories of models in the library
 INCH_M = 0.0254
 SKIN_M = 0.004  # half of a car body's thickness
 # Cars with fewer triangles look like boxes.
@@ -47,7 +48,12 @@ USUAL_WHEEL = "trb1-1"  # for cars that name none
 
 
 def open_torcs(cache: Path | None = None) -> Library:
-    """All tracks and cars; fetched and converted at the first call, which takes minutes.
+    """The library of all tracks and cars, in metres.
+
+    The package is fetched and converted at the first call, which takes minutes.
+
+    Args:
+        cache: the folder in which models are kept; None: the usual one, see `cache_folder`.
 
     Raises:
         InputError: the package cannot be fetched.
@@ -66,7 +72,11 @@ def convert(root: Path, folder: Path, log: Callable[[str], None]) -> Library:
     Args:
         root: where the package is unpacked.
         folder: of the library.
-        log: called with a line for each file that cannot be read; such models are left out.
+        log: called with a line for each model that is read, and for each that cannot be read and
+            is left out.
+
+    Raises:
+        InputError: no model could be read.
     """
     found = Library.read(folder)
     if found is not None:
@@ -83,11 +93,11 @@ def convert(root: Path, folder: Path, log: Callable[[str], None]) -> Library:
         name = path.name
         log(f"reading {name}")
         try:
-            mesh = _read_car(path) if category == CAR else _read(path / name)
+            mesh = _read_car(path) if category == CAR else _read_model(path / name)
         except (OSError, ValueError) as error:
             log(f"left out: {name}: {error}")
             continue
-        read = _pictures(path, game)
+        read = _picture_reader(path, game)
         mesh = mesh.with_materials([with_picture(one, read, folder, log) for one in mesh.materials])
         width, depth, height = (float(side) for side in mesh.high - mesh.low)
         entry = Entry(
@@ -96,10 +106,10 @@ def convert(root: Path, folder: Path, log: Callable[[str], None]) -> Library:
             category=category,
             file=str(path.relative_to(root)),
             size_m=(width, depth, height),
-            elevation_m=0.0,
-            top_m=None,
-            opening=False,
-            turn=None,
+            elevation_m=0.0,  # it stands on the ground
+            top_m=None,  # things may stand on it
+            opening=False,  # no door or window
+            turn=None,  # the mesh stands as it should
             creator=_creators(path),
             licence=_licence(mesh, name in free_art),
         )
@@ -111,7 +121,11 @@ def convert(root: Path, folder: Path, log: Callable[[str], None]) -> Library:
 
 
 def free_art_names(terms: str) -> set[str]:
-    """The tracks and cars that Debian's copyright file puts under the Free Art License."""
+    """The names of tracks and cars that Debian's copyright file puts under the Free Art License.
+
+    The file's paragraphs each have lines of files, such as "data/tracks/road/e-track-1/*", and a
+    line "License: ...".
+    """
     names: set[str] = set()
     for paragraph in re.split(r"\n\s*\n", terms):
         if re.search(r"^License: Free-Art-License", paragraph, re.MULTILINE):
@@ -120,7 +134,12 @@ def free_art_names(terms: str) -> set[str]:
 
 
 def _licence(mesh: Mesh, is_free_art: bool) -> str:
-    """The terms of a converted model; those of the game hold for its common pictures."""
+    """The terms of a converted model, for its index entry.
+
+    Args:
+        mesh: its pictures' names tell whether it uses the game's common ones, which are GPL.
+        is_free_art: whether the model itself is under the Free Art License; if not, it is GPL.
+    """
     common = any(one.texture is not None and one.texture.startswith("textures-")
                  for one in mesh.materials)  # fmt: skip
     if not is_free_art:
@@ -129,53 +148,69 @@ def _licence(mesh: Mesh, is_free_art: bool) -> str:
 
 
 def _creators(path: Path) -> str:
-    """Who is named as author beside a model; the game's authors if no one is."""
+    """The lines of a model's readme.txt that name authors; the game's authors if it has none."""
     readme = path / "readme.txt"
     content = readme.read_bytes() if readme.is_file() else b""
     try:
         text = content.decode("utf-8")
-    except UnicodeDecodeError:  # some are older than that
+    except UnicodeDecodeError:  # some files are older than UTF-8
         text = content.decode("latin1")
     lines = [line.strip() for line in text.splitlines()]
     found = [line for line in lines if re.search(r"copyright\b.*\d{4}|^track from", line, re.I)]
     return "; ".join(found) or "Eric Espié, Christophe Guionneau, Bernhard Wymann, Andrea Alfieri"
 
 
-def _read(stem: Path) -> Mesh:
-    """The mesh of STEM.acc, or of STEM.ac."""
+def _read_model(stem: Path) -> Mesh:
+    """The mesh of the file STEM.acc, TORCS' own format, or else of STEM.ac; z up, in its unit."""
     path = stem.with_name(stem.name + ".acc")
     if not path.is_file():
         path = stem.with_name(stem.name + ".ac")
     return read_ac3d(path.read_text(encoding="latin1"))
 
 
-def _pictures(path: Path, game: Path) -> ReadPicture:
-    """A reader of pictures: beside the model, then among the wheels', then the game's own."""
+def _picture_reader(path: Path, game: Path) -> ReadPicture:
+    """A function that reads a picture by the name that a model's file gives.
 
-    def read(name: str) -> tuple[str, bytes] | None:
-        """The full name and content; None if it is nowhere."""
+    Args:
+        path: the model's folder, where pictures are looked for first.
+        game: the game's folder, with pictures of wheels and those that all models share.
+    """
+
+    def read(name: str) -> NamedPicture | None:
+        """A name that tells the folder, too, and the file's content; None if it is nowhere."""
         for folder in (path, game / "wheels", game / "data" / "textures"):
             file = folder / name
             if file.is_file():
-                return f"{file.parent.name}-{file.name}", file.read_bytes()
+                return NamedPicture(f"{file.parent.name}-{file.name}", file.read_bytes())
         return None
 
     return read
 
 
 def _read_car(path: Path) -> Mesh:
-    """A car on its wheels, which looks along −y and stands on z = 0, as catalogue models do."""
-    body = _read(path / path.name)
-    # Bodies have an outer and an inner skin at one place, which look to opposite sides.
+    """A car on its wheels, in metres. It looks towards −y and stands on z = 0, z up.
+
+    The game's own cars have x forward, y to the left and z up. Their body is a model; their XML
+    file says where wheels are and how large.
+
+    Args:
+        path: the car's folder, which is called as the car.
+
+    Raises:
+        ValueError: the car's files cannot be read.
+    """
+    body = _read_model(path / path.name)
+    # Bodies have an outer and an inner skin at one place, whose normals are opposite. Each is moved
+    # along its own normals, so that rays meet the outer one.
     apart = body.corners + SKIN_M * body.normals
     body = dataclasses.replace(body, corners=apart.astype(np.float32))
     facts = (path / f"{path.name}.xml").read_text(encoding="latin1")
-    kinds = re.findall(r'name="3d wheel directory"[^>]*val="([^"]+)"', facts)
-    kind = kinds[0] if kinds else USUAL_WHEEL
-    wheel = _read(path.parents[1] / "wheels" / kind / "wheel0")
-    # Its picture is named by the wheel's folder, because all have the same name.
+    wheel_kinds = re.findall(r'name="3d wheel directory"[^>]*val="([^"]+)"', facts)
+    wheel_kind = wheel_kinds[0] if wheel_kinds else USUAL_WHEEL
+    wheel = _read_model(path.parents[1] / "wheels" / wheel_kind / "wheel0")
+    # Pictures of all kinds of wheels have the same name, so the kind's folder is put before it.
     wheel = wheel.with_materials(
-        [dataclasses.replace(one, texture=f"{kind}/{one.texture}") for one in wheel.materials]
+        [dataclasses.replace(one, texture=f"{wheel_kind}/{one.texture}") for one in wheel.materials]
     )
     parts = [body]
     for end in ("Front", "Rear"):
@@ -183,18 +218,29 @@ def _read_car(path: Path) -> Mesh:
         for side in ("Right", "Left"):
             section = f"{end} {side} Wheel"
             y = _number(facts, section, "ypos")
-            width = _number(facts, section, "tire width") / 1000  # files give millimetres
+            width = _number(facts, section, "tire width") / 1000  # the file gives millimetres
             rim = _number(facts, section, "rim diameter") * INCH_M
+            # The tyre is above and below the rim.
             diameter = rim + 2 * width * _number(facts, section, "tire height-width ratio")
-            # The file's wheel is one unit wide, with its axle along y; its outer side is the right.
-            turn = np.diag([diameter, width if y < 0 else -width, diameter])
-            parts.append(wheel.moved(turn, (x, y, diameter / 2)))
-    # The game's cars look along x.
+            # The wheel's model has a diameter and a width of 1, its middle at the origin, its axle
+            # along y and its outer side towards −y, the right; on the left it is mirrored.
+            scale = np.diag([diameter, width if y < 0 else -width, diameter])
+            parts.append(wheel.moved(scale, (x, y, diameter / 2)))
+    # From x forward and y left to −y forward and x left.
     return joined(parts).moved(np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
 
 
 def _number(facts: str, section: str, name: str) -> float:
-    """A number of a car's XML file, by its section; ValueError if it is missing."""
+    """A number of a car's XML file, in the file's own unit.
+
+    Args:
+        facts: the file's text.
+        section: of the file, such as "Front Axle".
+        name: of the number in it, such as "xpos".
+
+    Raises:
+        ValueError: it is missing.
+    """
     found = re.search(rf'section name="{section}">(.*?)</section>', facts, re.DOTALL)
     value = found and re.search(rf'name="{name}"[^>]*\bval="([^"]+)"', found.group(1))
     if not value:

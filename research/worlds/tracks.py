@@ -1,7 +1,10 @@
 """Race tracks from the second set of models, seen by a person beside or on the road.
 
-A place of a track is drawn, and what lies farther than the eye reaches is left out. Cars stand or
-drive on the road. The game's pictures of the ground are coarse, so they get finer grain.
+A place on a track's road is drawn at random and becomes the origin; what lies farther than 700 m is
+left out. Cars stand or drive on the road. The game's pictures of the ground and of walls have few
+pixels, so they are enlarged and get *grain*: noise in place of the fine detail that they lack.
+
+Lengths are in metres, z is up. Tracks lie as in their file, so a road has any direction.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +32,38 @@ from worlds.viewpoints import Viewpoint
 Rng = np.random.Generator
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
-REACH_M = 700.0  # triangles that begin farther away are left out
+REACH_M = 700.0  # triangles whose middle is farther away are left out
+CARS_REACH_M = 120.0  # cars are put on this part of the road, and the road is measured by it
+# Parts of the names of pictures by which they are told apart: those of roads, and those that are
+# not of roads in spite of such a word; those that get no grain, because they are not of ground or
+# walls.
 ROAD_WORDS = ("asphalt", "road", "tarmac", "-rd", "concrete-p", "track", "asf", "rsa_n", "dirt")
 NO_ROAD_WORDS = ("barrier", "wall", "curb", "shadow", "raceline", "grass", "side", "people")
-SMOOTH_WORDS = ("tree", "arbor", "forest", "bush", "sky", "people", "spec", "logo", "sign")
+NO_GRAIN_WORDS = ("tree", "arbor", "forest", "bush", "sky", "people", "spec", "logo", "sign")
 FLAT_COSINE = 0.9  # a road rises by less than 26 degrees
-FINE_PX = 1024  # pictures of the ground are enlarged to this width
+FINE_PX = 1024  # longer side to which pictures are enlarged, by a whole factor
+
+
+class RoadPoint(NamedTuple):
+    """A point on the road."""
+
+    place: NDArray[np.float64]  # [3]
+    normal: NDArray[np.float64]  # [3] of the road there, unit, upwards
+
+
+class TrianglePoint(NamedTuple):
+    """A point of a triangle."""
+
+    triangle: int  # its number
+    weights: NDArray[np.float64]  # [3] of its corners; their mean with these weights is the point
 
 
 def track(rng: Rng, library: Library) -> OpenPlan:
-    """A place at a race track, with its light.
+    """A random place at a race track, with cars, its light, and a source of cameras.
+
+    Args:
+        rng: for all random choices; each camera is drawn by a generator of its own.
+        library: the second set of models, from `worlds.torcs`: tracks and cars.
 
     Raises:
         InputError: the drawn track has no road.
@@ -46,53 +72,64 @@ def track(rng: Rng, library: Library) -> OpenPlan:
     cars = [model for model in library.models if model.entry.category == CAR]
     model = tracks[int(rng.integers(len(tracks)))]
     mesh = library.mesh(model)
-    road = road_triangles(mesh, model.entry.name)
-    if not len(road):
+    road_numbers = road_triangles(mesh, model.entry.name)
+    if not len(road_numbers):
         raise InputError(f"{model.entry.key}: no picture is that of a road: leave this track out")
 
-    # The middle of a random part of the road becomes the origin.
-    corners = mesh.corners[road]
-    middle = corners[int(rng.integers(len(corners)))].mean(0)
-    direction = _direction(corners, middle)
+    # The middle of a random triangle of the road becomes the origin.
+    whole_road = mesh.corners[road_numbers]
+    middle = whole_road[int(rng.integers(len(whole_road)))].mean(0)
+    ahead = _along_road(whole_road, middle)
     near = np.linalg.norm(mesh.corners.mean(1) - middle, axis=1) < REACH_M
-    part = Mesh(
+    surroundings = Mesh(
         mesh.corners[near] - middle,
         mesh.normals[near],
         mesh.uv[near],
         mesh.material[near],
         mesh.materials,
     )
-    part, pictures = _refined(part)
-    parts = [part]
+    surroundings, pictures = _with_grain(surroundings)
+    parts = [surroundings]
     used = {model.entry.key}
-    across = np.array([-direction[1], direction[0]])
-    local = (corners - middle)[np.linalg.norm((corners - middle)[:, :, :2].mean(1), axis=1) < 120]
-    width = _half_width(local, across)
+
+    # Up to eight cars, on the part of the road around the origin. Three of four stand ahead, where
+    # the cameras look; all drive that way.
+    to_left = np.array([-ahead[1], ahead[0]])
+    road = whole_road - middle
+    road = road[np.linalg.norm(road[:, :, :2].mean(1), axis=1) < CARS_REACH_M]
+    half_width = _half_width(road, to_left)
     for _ in range(int(rng.integers(2, 9))):
-        away = rng.uniform(6, 35) * rng.choice([1, 1, 1, -1])
-        side = rng.uniform(-0.7, 0.7) * width
+        distance = rng.uniform(6, 35) * rng.choice([1, 1, 1, -1])
+        left = rng.uniform(-0.7, 0.7) * half_width
         car = cars[int(rng.integers(len(cars)))] if cars else None
-        place = _on_road(local, direction * away + across * side)
-        if car is None or place is None:
+        point = _on_road(road, ahead * distance + to_left * left)
+        if car is None or point is None:
             continue
-        heading = _direction(local, place[0])
-        if heading @ direction < 0:
+        heading = _along_road(road, point.place)
+        # `_along_road` gives either of both senses.
+        if heading @ ahead < 0:
             heading = -heading
-        parts.append(_standing(library.mesh(car), *place, heading))
+        parts.append(_car_on_road(library.mesh(car), point, heading))
         used.add(car.entry.key)
 
     def draw(own: Rng, height: int, width_px: int) -> Viewpoint:
-        """A camera on the road or at its side, which looks along it or at the other side."""
-        offset = own.uniform(-1.0, 1.0) * width if own.random() < 0.5 else 0.0
+        """A random camera near the origin, beside the road, on it or in its middle.
+
+        It looks along the road; if it is off the middle, often a little towards the other side.
+        """
+        # Metres to the left of the road's middle: on the road, or up to 4 m beside it.
+        left = own.uniform(-1.0, 1.0) * half_width if own.random() < 0.5 else 0.0
         if own.random() < 0.5:
-            offset = own.choice([-1, 1]) * (width + own.uniform(0.5, 4.0))
-        point = across * offset + direction * own.uniform(-4, 4)
-        ground = _ground_height(part, point)
-        tall = own.uniform(1.3, 1.75) if own.random() < 0.8 else own.uniform(0.6, 1.3)
-        eye = (float(point[0]), float(point[1]), ground + float(tall))
-        azimuth = math.atan2(direction[1], direction[0]) + own.normal(0, 0.35)
-        if offset and own.random() < 0.6:
-            azimuth += math.copysign(own.uniform(0.1, 0.8), -offset)
+            left = own.choice([-1, 1]) * (half_width + own.uniform(0.5, 4.0))
+        point = to_left * left + ahead * own.uniform(-4, 4)
+        ground = _ground_height(surroundings, point)
+        # A standing person's eyes; sometimes stooping.
+        above = own.uniform(1.3, 1.75) if own.random() < 0.8 else own.uniform(0.6, 1.3)
+        eye = (float(point[0]), float(point[1]), ground + float(above))
+        azimuth = math.atan2(ahead[1], ahead[0]) + own.normal(0, 0.35)
+        if left and own.random() < 0.6:
+            # From the left side to the right is a turn to smaller azimuths.
+            azimuth += math.copysign(own.uniform(0.1, 0.8), -left)
         return held_camera(own, eye, azimuth, height, width_px)
 
     return OpenPlan(
@@ -102,24 +139,30 @@ def track(rng: Rng, library: Library) -> OpenPlan:
         lights=daylight(rng),
         draw_viewpoint=draw,
         models=tuple(sorted(used)),
-        coarse_m=1.5,
+        coarse_m=1.5,  # more than the 1 m of streets, because places are larger
     )
 
 
 def road_triangles(mesh: Mesh, name: str) -> NDArray[np.int64]:
-    """The indices of triangles that are road, by the names of their pictures and their slope.
+    """[R] the numbers of a track's triangles that are road, by their pictures' names and slope.
 
-    `name` is the track's; pictures in the library begin with it.
+    Args:
+        mesh: the track.
+        name: the track's; the names of its pictures in the library begin with it.
     """
     is_road = np.array([_is_road(one, name) for one in mesh.materials], bool)
     sides = mesh.corners[:, 1:].astype(np.float64) - mesh.corners[:, :1]
     normal = np.cross(sides[:, 0], sides[:, 1])
+    # Normals may look up or down.
     flat = np.abs(normal[:, 2]) > FLAT_COSINE * np.linalg.norm(normal, axis=1)
     return np.flatnonzero(is_road[mesh.material] & flat)
 
 
 def _is_road(material: Material, track_name: str) -> bool:
-    """Whether a material's picture is that of a road, by its name without the track's."""
+    """Whether a material's picture is that of a road.
+
+    The words of its name tell, without the track's name, which may have such words, too.
+    """
     if material.texture is None:
         return False
     name = Path(material.texture).name.removeprefix(f"{track_name}-").lower()
@@ -128,119 +171,175 @@ def _is_road(material: Material, track_name: str) -> bool:
     return any(word in name for word in ROAD_WORDS)
 
 
-def _direction(corners: Floats, place: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[2] unit vector along the road at a place [3], from its triangles [R, 3, 3] around it."""
-    points = corners.reshape(-1, 3)[:, :2].astype(np.float64)
-    away = np.linalg.norm(points - place[:2], axis=1)
-    nearby = points[away < max(25.0, float(np.sort(away)[min(8, len(away) - 1)]))]
+def _along_road(road: Floats, place: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[2] unit vector in x and y along the road at a place, in either of its two senses.
+
+    It is the direction in which the corners of the road's triangles near the place spread most.
+
+    Args:
+        road: [R, 3, 3] corners of its triangles.
+        place: [3] a point of the road.
+    """
+    points = road.reshape(-1, 3)[:, :2].astype(np.float64)
+    distance = np.linalg.norm(points - place[:2], axis=1)
+    # Those within 25 m, but at least about eight: triangles may be long.
+    nearby = points[distance < max(25.0, float(np.sort(distance)[min(8, len(distance) - 1)]))]
+    # A little is added on the diagonal, so that points at one place have a direction, too.
     spread = np.cov((nearby - nearby.mean(0)).T) + 1e-6 * np.eye(2)
-    _, axes = np.linalg.eigh(spread)
+    _, axes = np.linalg.eigh(spread)  # columns, the one with the largest spread last
     return np.asarray(axes[:, 1], np.float64)
 
 
-def _half_width(corners: Floats, across: NDArray[np.float64]) -> float:
-    """Half of the road's width at the origin, from its triangles [R, 3, 3]."""
-    points = corners.reshape(-1, 3)[:, :2]
+def _half_width(road: Floats, across: NDArray[np.float64]) -> float:
+    """Half of the road's width at the origin in metres, roughly; between 2.5 and 9.
+
+    Args:
+        road: [R, 3, 3] corners of its triangles; its middle is near the origin.
+        across: [2] unit vector across it.
+    """
+    points = road.reshape(-1, 3)[:, :2]
     near = points[np.linalg.norm(points, axis=1) < 15]
     if not len(near):
-        return 4.0
+        return 4.0  # a usual one
+    # Not the largest distance, so that a few corners of a wider place do not count.
     return float(np.clip(np.quantile(np.abs(near @ across), 0.8), 2.5, 9.0))
 
 
-def _on_road(
-    corners: Floats, point: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """The place [3] on the road at x and y, and the road's upward normal [3]; None beside it."""
-    triangle, weights = _under(corners, point)
-    if triangle is None:
+def _on_road(road: Floats, point: NDArray[np.float64]) -> RoadPoint | None:
+    """The point of the road above or below x and y; None where there is no road.
+
+    Args:
+        road: [R, 3, 3] corners of its triangles.
+        point: [2] x and y.
+    """
+    found = _triangle_at(road, point)
+    if found is None:
         return None
-    points = corners[triangle].astype(np.float64)
-    normal = np.cross(points[1] - points[0], points[2] - points[0])
+    corners = road[found.triangle].astype(np.float64)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     normal *= np.sign(normal[2]) / np.linalg.norm(normal)
-    return weights @ points, normal
+    return RoadPoint(found.weights @ corners, normal)
 
 
-def _under(corners: Floats, point: NDArray[np.float64]) -> tuple[int | None, NDArray[np.float64]]:
-    """The highest triangle of [F, 3, 3] below or above x and y, and the weights of its corners."""
+def _triangle_at(corners: Floats, point: NDArray[np.float64]) -> TrianglePoint | None:
+    """The first triangle that lies above or below x and y, and its point there; None if none does.
+
+    Args:
+        corners: [F, 3, 3] of the triangles.
+        point: [2] x and y.
+    """
     flat = corners[:, :, :2].astype(np.float64)
-    a = flat[:, 1] - flat[:, 0]
-    b = flat[:, 2] - flat[:, 0]
-    p = point - flat[:, 0]
-    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    area = np.where(np.abs(area) < 1e-9, np.inf, area)
-    u = (p[:, 0] * b[:, 1] - p[:, 1] * b[:, 0]) / area
-    v = (a[:, 0] * p[:, 1] - a[:, 1] * p[:, 0]) / area
+    first_side = flat[:, 1] - flat[:, 0]
+    second_side = flat[:, 2] - flat[:, 0]
+    to_point = point - flat[:, 0]
+    # Barycentric coordinates: the point is the first corner + u · first side + v · second side.
+    area = _cross2(first_side, second_side)
+    area = np.where(np.abs(area) < 1e-9, np.inf, area)  # upright triangles have no area from above
+    u = _cross2(to_point, second_side) / area
+    v = _cross2(first_side, to_point) / area
     inside = np.flatnonzero((u >= 0) & (v >= 0) & (u + v <= 1) & np.isfinite(area))
     if not len(inside):
-        return None, np.zeros(3)
-    best = int(inside[0])
-    return best, np.array([1 - u[best] - v[best], u[best], v[best]])
+        return None
+    number = int(inside[0])
+    weights = np.array([1 - u[number] - v[number], u[number], v[number]])
+    return TrianglePoint(number, weights)
+
+
+def _cross2(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N] signed areas of the parallelograms of vectors a and b, each [N, 2]."""
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def _ground_height(mesh: Mesh, point: NDArray[np.float64]) -> float:
-    """Height of the ground at x and y: the highest nearly level triangle within 3 m of z = 0."""
-    boxes = mesh.corners[:, :, :2]
-    over = (boxes.min(1) <= point).all(1) & (boxes.max(1) >= point).all(1)
-    candidates = mesh.corners[over]
-    heights = [0.0]
-    for corners in candidates:
-        triangle, weights = _under(corners[None], point)
-        if triangle is None:
-            continue
-        height = float(weights @ corners[:, 2])
-        if abs(height) < 3:
-            heights.append(height)
-    return max(heights[1:], default=0.0)
+    """Height of the ground at x and y in metres: the highest surface within 3 m of z = 0, or 0.
 
-
-def _standing(
-    mesh: Mesh,
-    place: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    heading: NDArray[np.float64],
-) -> Mesh:
-    """A car on the road.
+    Bridges and trees are higher than 3 m, as a rule.
 
     Args:
-        mesh: looks towards −y.
-        place: [3] where it stands.
-        normal: [3] of the road there, upwards.
-        heading: [2] where it drives.
+        mesh: a track's part whose road passes through the origin.
+        point: [2] x and y, a few metres from the origin.
     """
+    # The triangles whose box in x and y has the point in it.
+    flat = mesh.corners[:, :, :2]
+    may_lie_there = (flat.min(1) <= point).all(1) & (flat.max(1) >= point).all(1)
+    heights = []
+    for corners in mesh.corners[may_lie_there]:
+        found = _triangle_at(corners[None], point)
+        if found is None:
+            continue
+        height = float(found.weights @ corners[:, 2])
+        if abs(height) < 3:
+            heights.append(height)
+    return max(heights, default=0.0)
+
+
+def _car_on_road(car: Mesh, point: RoadPoint, heading: NDArray[np.float64]) -> Mesh:
+    """A car, turned and moved so that it stands on the road.
+
+    Args:
+        car: stands on z = 0 at the origin and looks towards −y.
+        point: where it stands, and the road's normal there.
+        heading: [2] unit vector in x and y, where it drives.
+    """
+    # The heading, tilted into the road's plane.
     forward = np.array([*heading, 0.0])
-    forward -= (forward @ normal) * normal
+    forward -= (forward @ point.normal) * point.normal
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, normal)
+    right = np.cross(forward, point.normal)
     # The columns are where the model's x, y and z go: its right is −x, its front −y.
-    turn = np.stack([-right, -forward, normal], 1)
-    return mesh.moved(turn, place.tolist())
+    turn = np.stack([-right, -forward, point.normal], 1)
+    return car.moved(turn, point.place.tolist())
 
 
-def _refined(mesh: Mesh) -> tuple[Mesh, dict[str, Bytes]]:
-    """The mesh with finer pictures of the ground and of walls, and these pictures by name."""
+class _MeshWithPictures(NamedTuple):
+    """A mesh, and pictures that were made for it."""
+
+    mesh: Mesh
+    pictures: dict[str, Bytes]  # by name; materials have these names as their texture
+
+
+def _with_grain(mesh: Mesh) -> _MeshWithPictures:
+    """A track whose pictures of the ground and of walls are enlarged and have grain.
+
+    All materials become matt and white, because what a track's files say of them fits no picture.
+    """
     pictures: dict[str, Bytes] = {}
     skins = []
     used = set(np.unique(mesh.material).tolist())
     for number, material in enumerate(mesh.materials):
-        # Files give grass and trees the shine of glass.
+        # Files give grass and trees the shine of glass, so all become matt. Their colours would
+        # darken the pictures once more: white leaves pictures as they are, and makes the few
+        # surfaces without a picture white.
         material = dataclasses.replace(material, specular=0.0, color=(1.0, 1.0, 1.0))
-        if number in used and material.texture is not None and _wants_grain(material.texture):
+        if number in used and material.texture is not None and _may_get_grain(material.texture):
             name = f"fine-{Path(material.texture).name}"
             pictures[name] = fine_picture(material.texture)
             material = dataclasses.replace(material, texture=name)
         skins.append(material)
-    return mesh.with_materials(skins), pictures
+    return _MeshWithPictures(mesh.with_materials(skins), pictures)
 
 
-def _wants_grain(texture: str) -> bool:
-    """Whether a picture is of ground or walls: not of trees, people or letters."""
+def _may_get_grain(texture: str) -> bool:
+    """Whether a picture's file is of ground or walls: not of trees, people, sky or letters.
+
+    Its name tells, and that it has no holes: pictures with alpha are of leaves or fences.
+    """
     name = Path(texture).name.lower()
-    return not any(word in name for word in SMOOTH_WORDS) and load_picture(texture).shape[2] == 3
+    if any(word in name for word in NO_GRAIN_WORDS):
+        return False
+    channels: int = load_picture(texture).shape[2]
+    return channels == 3
 
 
 @functools.lru_cache(128)
 def fine_picture(file: str) -> Bytes:
-    """[H, W, 3] a picture enlarged to FINE_PX, with grain that it would have if it were sharp."""
+    """[H, W, 3] a file's picture, enlarged, with noise in place of the fine detail that it lacks.
+
+    It becomes as many times larger, a whole number, as its longer side fits into FINE_PX. A picture
+    that would have to be less than twice as large stays as it is.
+
+    `file` is the path of a picture without alpha.
+    """
     small = load_picture(file)
     height, width = small.shape[:2]
     factor = max(1, FINE_PX // max(height, width))
@@ -248,8 +347,11 @@ def fine_picture(file: str) -> Bytes:
         return small
     size = (width * factor, height * factor)
     large = np.asarray(Image.fromarray(small).resize(size, Image.Resampling.BICUBIC), np.float32)
+    # Any seed serves that is the same at each call.
     rng = np.random.default_rng(len(file))
     shape = (size[1], size[0])
+    # Noise from pixel to pixel, and stronger noise with spots of 6 pixels and less.
     grain = 0.55 * rng.standard_normal(shape) + cloud_noise(rng, shape, max(8, size[0] // 6), 3)
+    # Both together have a deviation of about 1.1: pixels get about 10 % brighter or darker.
     fine = large * (1 + 0.09 * grain.astype(np.float32))[..., None]
     return np.asarray(np.clip(fine, 0, 255), np.uint8)

@@ -3,8 +3,12 @@
     PYTHONPATH=src:research python -m worlds.train_residual --recipe cpu -o OUT \\
         worlds.folder=WORLDS worlds.validation=OTHERS data.photos=PHOTOS ...
 
-The recipe is one of `spackle train`; `worlds.KEY=VALUE` are keys of `WorldViews`. OUT gets the same
-files, and the same command resumes a run.
+The recipe is one of `spackle train`, which names the usual sources of training views: photos,
+stereo pairs, depth cameras. `worlds.KEY=VALUE` are keys of `WorldViews`. OUT gets the same files as
+from `spackle train`, and the same command resumes a run.
+
+Training views are cut into crops, which are stored in files. Files of the usual sources and of
+worlds are then mixed.
 """
 
 from __future__ import annotations
@@ -35,7 +39,7 @@ from spackle.paper.training.train import train
 from spackle.render import Renderer
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Reporter
-from worlds.second_views import BASES, Base, second_view_source
+from worlds.second_views import DEPTH_KINDS, DepthKind, second_view_source
 
 INTERRUPTED = 130  # the exit status of a run that was stopped by a signal
 VIEWS_VERSION = 1  # increases whenever the same worlds would give other training views
@@ -44,11 +48,14 @@ VIEWS_VERSION = 1  # increases whenever the same worlds would give other trainin
 class WorldViews(RecipePart):
     """Second views of worlds as training data."""
 
-    folder: Annotated[Path, MAY_CHANGE_ON_RESUME]  # of archives, with its subfolders
-    validation: Annotated[Path, MAY_CHANGE_ON_RESUME]  # archives that the run does not learn from
-    validation_views: Count = 6  # of each archive: the first world's
-    bases: Annotated[tuple[Base, ...], Field(min_length=1)] = BASES  # in turn, one a world
-    share: Annotated[float, Field(gt=0, lt=1)] = 0.4  # of all crops
+    # A folder of archives of worlds to learn from, and one of archives for validation alone; both
+    # with their subfolders.
+    folder: Annotated[Path, MAY_CHANGE_ON_RESUME]
+    validation: Annotated[Path, MAY_CHANGE_ON_RESUME]
+    validation_views: Count = 6  # of each archive: as many second views as its first world has
+    # By what depths the worlds' photos are lifted, in turn, one for each world.
+    bases: Annotated[tuple[DepthKind, ...], Field(min_length=1)] = DEPTH_KINDS
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.4  # of all files of crops, those of worlds
 
 
 class WorldsRecipe(Recipe):
@@ -74,14 +81,22 @@ class WorldsTask(ResidualTask):
                 f"worlds.validation: holds {min(shared)}, as worlds.folder does: give each archive "
                 "to one of them"
             )
-        self.usual_digest = self.digest  # of the crops of the usual sources
+        # The digest that `ResidualTask` has set identifies the crops of the usual sources alone.
+        # The own digest of this task identifies all data of a run, to which worlds belong.
+        self.usual_digest = self.digest
         names = [file.name for file in (*self.archives, *self.held_archives)]
         settings = (VIEWS_VERSION, recipe.worlds.bases, recipe.worlds.share)
         self.digest = short_digest((self.usual_digest, settings, names))
 
     def _make_crops(self, output: Path, reporter: Reporter) -> None:
-        """Make the crops that do not exist yet: those of the usual sources, then of the worlds."""
-        # The folder of the usual crops is that of `spackle train`, which knows no worlds.
+        """Make the crops that do not exist yet, and set `training` and `validation` to all of them.
+
+        Args:
+            output: the run's folder; crops lie in its subfolder unless the recipe names a cache.
+            reporter: shows progress.
+        """
+        # First the usual crops. Their folder is named by their digest, so that it is the one that
+        # `spackle train` uses, which knows no worlds.
         own_digest = self.digest
         self.digest = self.usual_digest
         super()._make_crops(output, reporter)
@@ -89,6 +104,7 @@ class WorldsTask(ResidualTask):
         assert isinstance(self.training, StoredCrops)
         assert isinstance(self.validation, StoredCrops)
 
+        # Then the worlds' crops.
         folder = self.recipe.data.cache or output / CACHE
         make = functools.partial(
             make_world_crops, self.recipe.data, self.worlds.bases, folder, self.renderer, reporter
@@ -102,55 +118,71 @@ class WorldsTask(ResidualTask):
 
 def make_world_crops(
     data: DataRecipe,
-    bases: Sequence[Base],
+    depth_kinds: Sequence[DepthKind],
     folder: Path,
     renderer: Renderer,
     reporter: Reporter,
     archives: Sequence[Path],
     views: int | None = None,
 ) -> list[Path]:
-    """Make the crops of archives of worlds that do not exist yet; returns the files of all of them.
+    """The files of all crops of second views of worlds; files that are missing are made.
 
     Args:
         data: how many crops are cut from a view, and how large.
-        bases: as of `second_view_source`.
-        folder: gets a folder for each archive, so that more archives leave the others as they are.
-        renderer: renders the views.
-        reporter: shows progress.
+        depth_kinds: by what depths the worlds' photos are lifted, in turn, one for each world.
+        folder: gets a folder for each archive, so that crops of the others stay valid when an
+            archive comes.
+        renderer: renders the lifted photos at second cameras.
+        reporter: shows progress, by archives, and says which views cannot be used.
         archives: of worlds.
-        views: only the first views of each archive; None: all.
+        views: how many views of each archive, from its first on; None: all.
     """
-    settings = (SAMPLES_VERSION, VIEWS_VERSION, data.crops, data.cells, tuple(bases))
+    # What determines the content of crops; an archive's worlds have its name.
+    settings = (SAMPLES_VERSION, VIEWS_VERSION, data.crops, data.cells, tuple(depth_kinds))
     crops_folder = folder / short_digest(settings)
     files: list[Path] = []
     with reporter.stage("worlds") as progress:
-        for done, archive in enumerate(archives, 1):
-            source = second_view_source(archive, bases, renderer)
-            assert source.views is not None
+        for archives_done, archive in enumerate(archives, 1):
+            source = second_view_source(archive, depth_kinds, renderer)
+            assert source.views is not None  # an archive has a limited number
+            # `make_samples` makes only those files that the folder lacks.
             files += make_samples(
                 data=data,
                 sources=[source],
                 folder=crops_folder / archive.stem,
-                seed=0,  # decides where crops lie; the views are the worlds'
+                seed=0,  # decides where crops lie; the worlds determine the views
                 views=views or source.views,
-                progress=lambda done, count: None,
-                warn=reporter.detail,  # views that were refused
+                progress=lambda views_done, view_count: None,  # archives are counted instead
+                warn=reporter.detail,  # called for views that cannot be used
             )
-            progress(done, len(archives))
+            progress(archives_done, len(archives))
     return files
 
 
 def find_archives(folder: Path, key: str) -> list[Path]:
-    """The archives of worlds below a folder, sorted; InputError, which names `key`, without any."""
+    """The archives of worlds below a folder, sorted.
+
+    Args:
+        folder: where to look, its subfolders included.
+        key: the recipe's key that names the folder, for messages.
+
+    Raises:
+        InputError: there are none, or no such folder.
+    """
     return find_files(folder, key, (".tar",), "archives worlds-NNNNN.tar")
 
 
 def mixed(usual: Sequence[Path], worlds: Sequence[Path], share: float) -> list[Path]:
-    """Files of which the fraction `share` are of `worlds`; each file is there at least once.
+    """All files of `usual`, then all of `worlds`; one kind is repeated until the share is right.
 
-    Of the kind that is too few, all files are repeated in turn.
+    Args:
+        usual: files of crops of the usual sources; at least one.
+        worlds: files of crops of worlds; at least one.
+        share: in 0..1, both excluded: how much of the result shall be of `worlds`. If they are less
+            than that, they are repeated in turn; if they are more, `usual` is.
     """
-    # Either all files of `usual`, and as many of `worlds` as they need, or the other way round.
+    # To `worlds` as they are belong this many usual files, and the other way round. One of the two
+    # numbers is not above the files that there are; then those stay as they are.
     usual_count = max(len(usual), round(len(worlds) * (1 - share) / share))
     world_count = max(len(worlds), round(len(usual) * share / (1 - share)))
     return [
@@ -160,18 +192,25 @@ def mixed(usual: Sequence[Path], worlds: Sequence[Path], share: float) -> list[P
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status."""
+    """Run the command; returns the exit status: 0, 2 for bad input, 130 for a stopped run."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--recipe", type=Path, required=True, help="as of `spackle train`")
+    parser.add_argument(
+        "--recipe", type=Path, required=True, help="a recipe's name or file, as for `spackle train`"
+    )
     parser.add_argument(
         "-o", "--output", type=Path, required=True, help="a folder; a run in it goes on"
     )
     parser.add_argument(
         "--overwrite", action="store_true", help="start anew where the folder holds a run"
     )
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="worlds.share=0.5")
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="settings of the recipe, such as worlds.share=0.5",
+    )
     options = parser.parse_intermixed_args(arguments)
     try:
         recipe = load_recipe(WorldsRecipe, options.recipe, options.overrides)

@@ -73,7 +73,13 @@ def choose_viewpoint(
 def best_viewpoint(
     world: World, candidates: Sequence[Viewpoint], near_m: float = MIN_NEAR_M
 ) -> Viewpoint | None:
-    """The candidate that shows the most; None if all stand in a thing, or nearer than `near_m`."""
+    """The camera that shows the most surfaces at the most depths; None if all are blocked.
+
+    Args:
+        world: what they see.
+        candidates: at least one.
+        near_m: a camera is blocked by things that are nearer than this, in metres.
+    """
     scores = [_score(world, candidate, near_m) for candidate in candidates]
     best = int(np.argmax(scores))
     return candidates[best] if scores[best] > 0 else None
@@ -118,8 +124,12 @@ def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpo
 
 
 def camera_axes(azimuth: float, pitch: float, roll: float) -> Floats:
-    """[3, 3] rows right, down and forward of a camera that looks along an azimuth, upwards by
-    `pitch`, and is rolled clockwise.
+    """[3, 3] unit vectors of a camera in a world with z up: rows right, down and forward.
+
+    Args:
+        azimuth: of the direction in which it looks, from x towards y, in radians.
+        pitch: how far it looks upwards, in radians.
+        roll: how far it is turned clockwise around that direction, in radians.
     """
     forward = np.array(
         [math.cos(pitch) * math.cos(azimuth), math.cos(pitch) * math.sin(azimuth), math.sin(pitch)]
@@ -134,7 +144,11 @@ def camera_axes(azimuth: float, pitch: float, roll: float) -> Floats:
 
 
 def _score(world: World, viewpoint: Viewpoint, near_m: float) -> float:
-    """How much a camera shows: many surfaces at many depths; negative where it is blocked."""
+    """How much a camera shows, without a unit: more for many surfaces at many depths.
+
+    It is −1 if the camera sees too little, or stands in a thing or before one that is nearer than
+    `near_m` metres, and −0.5 if one thing fills much of its picture.
+    """
     rows, columns = PROBE
     camera = viewpoint.camera.resized(columns, rows)
     origins, directions = viewpoint.rays(camera, pixel_grid(rows, columns))
@@ -142,7 +156,9 @@ def _score(world: World, viewpoint: Viewpoint, near_m: float) -> float:
     depth = hits.distance[hits.triangle >= 0]
     if len(depth) < 0.5 * rows * columns or np.quantile(depth, 0.01) < near_m:
         return -1.0
-    if np.quantile(depth, 0.3) < 0.7 + 3 * (near_m - MIN_NEAR_M):  # something fills the picture
+    # A thing fills the picture if 30 % of it are nearer than 0.7 m in rooms, where `near_m` is
+    # MIN_NEAR_M; where it is more, this distance grows three times as fast.
+    if np.quantile(depth, 0.3) < 0.7 + 3 * (near_m - MIN_NEAR_M):
         return -0.5
     # Many materials (the entropy of their shares of the picture), near and far things, and not
     # too much sky.

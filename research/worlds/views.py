@@ -23,7 +23,9 @@ Bools = NDArray[np.bool_]
 EDGE_RAYS = 4  # further rays of a pixel at an edge
 EDGE_COSINE = 0.93  # neighbours of one surface have normals at less than 22 degrees
 EDGE_RATIO = 0.02  # neighbours of one surface are this near to each other's plane, in depths
-COARSE_M = 0.22  # width of coarse cells of light in rooms
+# Width in rooms, in metres, of the coarse cells of light: light that surfaces send to each other is
+# kept on cells of one width; what a picture shows, on fine cells of about five of its pixels.
+COARSE_M = 0.22
 SHINY = 0.35  # surfaces rougher than this show no reflections
 GLASS_SHINE = 0.1  # share of light that panes reflect; it comes from the room's mean
 MAX_RADIANCE = 12.0  # brighter rays would make edges hard again
@@ -65,17 +67,21 @@ def render(
     cameras: list[Camera],
     coarse_m: float = COARSE_M,
 ) -> list[View]:
-    """The views of a world from several cameras, lit alike.
+    """The views of a world from several cameras, in their order, all with the same light.
 
     Args:
         rng: directions of rays.
-        world, lights: the world.
-        viewpoint: the photo's camera.
+        world: the triangles, in metres.
+        lights: what shines on them: sky, sun, windows, lamps.
+        viewpoint: the photo's camera, and where it is in the world.
         cameras: the views' cameras, in the photo's coordinates.
-        coarse_m: width of the coarse cells of light in metres.
+        coarse_m: width in metres of the coarse cells, which have one width everywhere, and on which
+            surfaces light each other. What the views show is kept on fine cells, which are about
+            five pixels wide in the photo.
     """
-    traced = [_trace(world, viewpoint, camera) for camera in cameras]
-    # The light is found once, on all surfaces that any view sees.
+    traced = [_traced_at_centers(world, viewpoint, camera) for camera in cameras]
+    # The light is found once, on all surfaces that any view sees. The photo's eye and focal length
+    # tell how wide a fine cell is there.
     met = [one.hits.triangle >= 0 for one in traced]
     focal_px = viewpoint.camera.focal[0]
     irradiance = solve(
@@ -88,11 +94,17 @@ def render(
         focal_px,
         coarse_m,
     )
-    return [_finished(rng, world, lights, irradiance, viewpoint, one) for one in traced]
+    return [_view_of_rays(rng, world, lights, irradiance, viewpoint, one) for one in traced]
 
 
-def _trace(world: World, viewpoint: Viewpoint, camera: Camera) -> _Traced:
-    """Send one ray through the middle of each pixel."""
+def _traced_at_centers(world: World, viewpoint: Viewpoint, camera: Camera) -> _Traced:
+    """The rays through the middles of a camera's pixels, row by row, and where they end.
+
+    Args:
+        world: the triangles.
+        viewpoint: the photo's camera, and where it is in the world.
+        camera: in the photo's coordinates.
+    """
     origins, directions = viewpoint.rays(camera, pixel_grid(camera.height, camera.width))
     return _traced(world, camera, origins, directions)
 
@@ -106,7 +118,7 @@ def _traced(world: World, camera: Camera, origins: Floats, directions: Floats) -
     return _Traced(camera, origins, directions, hits, smooth, flat, positions)
 
 
-def _finished(
+def _view_of_rays(
     rng: Rng,
     world: World,
     lights: Lights,
@@ -114,12 +126,12 @@ def _finished(
     viewpoint: Viewpoint,
     middle: _Traced,
 ) -> View:
-    """A view with smooth edges.
+    """A camera's view, coloured by the rays through its pixels and by more rays at edges.
 
     Args:
         rng: places of the further rays in the pixels at edges.
         world, lights, irradiance: the world and its light.
-        viewpoint: the photo's camera.
+        viewpoint: the photo's camera, and where it is in the world.
         middle: the rays through the middles of the view's pixels.
     """
     camera = middle.camera
@@ -258,7 +270,8 @@ def _shaded(
             world, lights, irradiance, shaded, positions, normals, towards, material
         )
         if np.isfinite(lights.haze_m):
-            # Haze takes the light of far surfaces, and gives that of the sky.
+            # Haze takes the light of far surfaces, and gives that of the sky near the horizon. At
+            # a distance of `haze_m` metres 1/e of a surface's light is left.
             clear = np.exp(-part.distance * lengths[found] / lights.haze_m)[:, None]
             shaded = shaded * clear + (1 - clear) * lights.haze_color
         colors[found] = shaded

@@ -15,7 +15,7 @@ pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 from worlds import surfaces, views, world_sheet
 from worlds.furniture import Furniture
 from worlds.library import Library
-from worlds.make import make_shards, make_world
+from worlds.make import PackedWorld, make_shards, make_world
 from worlds.placing import Box, Opening, Place
 from worlds.shards import read_view, shard_file, world_facts, world_keys, write_shard
 
@@ -105,12 +105,12 @@ def test_facts_name_models_trajectories_and_known_share(
 def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
     made: list[int] = []
 
-    def make(number: int) -> tuple[bytes, int]:
+    def make(number: int) -> PackedWorld:
         """Bytes that tell the number; the tenth world fails in the first run."""
         if number == 9 and len(made) == 9:
             raise KeyboardInterrupt
         made.append(number)
-        return bytes([number]) * 512, 7
+        return PackedWorld(bytes([number]) * 512, views=7)
 
     with pytest.raises(KeyboardInterrupt):
         make_shards(tmp_path, make, 12, (0, 1), print)
@@ -121,9 +121,9 @@ def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
 
 
 def test_two_processes_share_the_work(tmp_path: Path) -> None:
-    def make(number: int) -> tuple[bytes, int]:
+    def make(number: int) -> PackedWorld:
         """Bytes that tell the number."""
-        return bytes([number]) * 512, 7
+        return PackedWorld(bytes([number]) * 512, views=7)
 
     make_shards(tmp_path, make, 24, (1, 2), print)
     assert [file.name for file in tmp_path.iterdir()] == [shard_file(tmp_path, 1).name]

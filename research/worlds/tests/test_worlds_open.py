@@ -19,7 +19,7 @@ from worlds.caster import World
 from worlds.gardens import garden
 from worlds.houses import Hole, choose_style, holed_wall, house, leafy, pole
 from worlds.library import Library
-from worlds.make import make_open_world, make_shards
+from worlds.make import PackedWorld, make_open_world, make_shards
 from worlds.meshes import Faces, Material, Mesh, box, face_normals, joined, quad
 from worlds.outdoors import Scene, repainted, thinned
 from worlds.plans import OpenPlan
@@ -509,9 +509,9 @@ def test_fine_pictures_keep_their_mean(tmp_path: Path) -> None:
 
 
 def test_archives_are_called_by_their_kind(tmp_path: Path) -> None:
-    def make(number: int) -> tuple[bytes, int]:
+    def make(number: int) -> PackedWorld:
         """Bytes that tell the number."""
-        return bytes([number]) * 512, 7
+        return PackedWorld(bytes([number]) * 512, views=7)
 
     make_shards(tmp_path, make, 3, (0, 1), print, "tracks")
     assert [file.name for file in tmp_path.iterdir()] == ["tracks-00000.tar"]

@@ -17,7 +17,7 @@ pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 from worlds.judge_residual import judge, views_of_worlds
 from worlds.photo_camera import Development, developed, photographed
 from worlds.second_views import (
-    BASES,
+    DEPTH_KINDS,
     MAX_OUTLINE_ERROR_PX,
     as_colors,
     base_of_world,
@@ -195,7 +195,7 @@ def test_the_sky_lies_behind_all_surfaces() -> None:
 def test_all_bases_give_training_views_of_an_archive(tmp_path: Path) -> None:
     path = shard_file(tmp_path, 0)
     write_worlds(path, first=0, count=3)
-    source = second_view_source(path, BASES, get_renderer())
+    source = second_view_source(path, DEPTH_KINDS, get_renderer())
     assert source.views == 18
     for index in (0, 6, 12):
         sample = source.view(np.random.default_rng(0), index)
