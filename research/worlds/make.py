@@ -62,7 +62,7 @@ OPEN_MIN_KNOWN = 0.5
 OPEN_BALANCED = (0.05, 0.45)
 OPEN_NEAR_M = 0.8  # in the open: nearer things fill the picture
 VERSION = 2  # increases whenever the same seed gives other rooms
-OPEN_VERSION = 1  # increases whenever the same seed gives other streets, gardens or tracks
+OPEN_VERSION = 2  # increases whenever the same seed gives other streets, gardens or tracks
 # How the names of archives begin, by the kind of worlds in them.
 PREFIXES = {"rooms": ROOMS_PREFIX, "streets": "streets", "tracks": "tracks"}
 DrawPlan = Callable[[Rng], OpenPlan]  # gives a random street, garden or track

@@ -413,8 +413,9 @@ def _add_cafe(scene: Scene, x: float) -> None:
     y = rng.uniform(4, 14)
     for _ in range(int(rng.integers(2, 5))):
         if scene.put(scene.find("cafe-table"), x, y, KERB_M, 0.0):
-            # Where each chair stands along the street, and its angle: its back is to the table.
-            for chair_y, angle in ((y + 0.6, 180.0), (y - 0.6, 360.0)):
+            # Where each chair stands along the street, and its angle: it looks at the table. The
+            # model's back rest is at +y at 0 degrees.
+            for chair_y, angle in ((y + 0.6, 0.0), (y - 0.6, 180.0)):
                 scene.put(scene.find("cafe-chair"), x, chair_y, KERB_M, angle, margin=0)
             if rng.random() < 0.5:
                 # Over the table, so that it may come 0.3 m into what stands there.

@@ -347,8 +347,8 @@ def fine_picture(file: str) -> Bytes:
         return small
     size = (width * factor, height * factor)
     large = np.asarray(Image.fromarray(small).resize(size, Image.Resampling.BICUBIC), np.float32)
-    # Any seed serves that is the same at each call.
-    rng = np.random.default_rng(len(file))
+    # Any seed serves that is the same at each call, wherever the pictures are kept.
+    rng = np.random.default_rng(len(Path(file).name))
     shape = (size[1], size[0])
     # Noise from pixel to pixel, and stronger noise with spots of 6 pixels and less.
     grain = 0.55 * rng.standard_normal(shape) + cloud_noise(rng, shape, max(8, size[0] // 6), 3)
