@@ -150,7 +150,7 @@ def terms(predicted: Tensor, truth: list[float], valid: list[bool]) -> dict[str,
         predicted[None, None],
         torch.tensor([[truth]]),
         torch.tensor([[valid]]),
-        DepthLossWeights(2.0, 3.0, 0.5, 0.25),
+        DepthLossWeights(factor=2.0, line=3.0, steps=0.5, offset=0.25),
     )
     numbers = {name: float(value) for name, value in found.items()}
     offset = numbers.pop("offset")
