@@ -210,8 +210,8 @@ def write_pairs(
 def collect(readings: Sequence[dict[str, Any]], keys: Sequence[dict[str, dict[str, str]]]) -> str:
     """A table of what readers wrote: a row for each version, or one for sheets of one version.
 
-    For pairs, a line says how often each version was preferred, and another how often each row,
-    which would be equally often if readers looked at the pictures alone.
+    For pairs, the last line says how often each version was preferred, and how often the upper and
+    the lower row of a picture, which is equally often if readers look at what is shown alone.
 
     Args:
         readings: each reader's file.

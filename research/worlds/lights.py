@@ -79,6 +79,21 @@ def sky_directions(shape: tuple[int, int]) -> Floats:
     )
 
 
+def direction_to_sun(azimuth: float, elevation: float) -> Floats:
+    """[3] the unit vector towards the sun, with z up.
+
+    Azimuth is the angle from x towards y, elevation that above the horizon, both in radians.
+    """
+    return np.array(
+        [
+            math.cos(elevation) * math.cos(azimuth),
+            math.cos(elevation) * math.sin(azimuth),
+            math.sin(elevation),
+        ],
+        np.float32,
+    )
+
+
 def made_sky(
     rng: np.random.Generator, sun_direction: Floats, backdrop: NDArray[np.uint8] | None
 ) -> Floats:

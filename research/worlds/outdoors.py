@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spackle.core.camera import Camera
 from spackle.core.focal_length import focal_mm_to_px
 from worlds.library import Library, Model
-from worlds.lights import SKY_SHAPE, Lights, cloud_noise, sky_directions
+from worlds.lights import SKY_SHAPE, Lights, cloud_noise, direction_to_sun, sky_directions
 from worlds.meshes import Material, Mesh, rotation_z
 from worlds.outdoor_surfaces import outdoor_surfaces
 from worlds.placing import Box
@@ -228,14 +228,7 @@ def daylight(rng: Rng) -> Lights:
     """Sun, sky and haze of a random hour, and no lamps; in 18 % of cases clouds hide the sun."""
     azimuth = rng.uniform(0, 2 * math.pi)
     elevation = math.radians(rng.uniform(14, 62))
-    sun = np.array(
-        [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ],
-        np.float32,
-    )
+    sun = direction_to_sun(azimuth, elevation)
     overcast = rng.random() < 0.18
     sky = open_sky(rng, sun, overcast)
     # The sun's colour, from nearly white to orange.

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worlds.furniture import Furniture
-from worlds.lights import Lights, made_sky
+from worlds.lights import Lights, direction_to_sun, made_sky
 from worlds.meshes import Material, Mesh, box, joined, quad, rotation_z
 from worlds.placing import WALLS, Box, Opening, Place, Placed, WallName
 from worlds.shell import (
@@ -879,14 +879,7 @@ def _light(room: Builder) -> Lights:
         frame = WallFrame(place, windows[0].wall)
         azimuth = math.atan2(frame.out[1], frame.out[0]) + rng.normal(0, 0.6)  # radians
     elevation = math.radians(rng.uniform(12, 60))
-    sun = np.array(
-        [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ],
-        np.float32,
-    )
+    sun = direction_to_sun(azimuth, elevation)
     # A photo stands at the horizon of most skies, if there are photos.
     backdrop = room.photo(rng) if room.photo is not None and rng.random() < 0.8 else None
     sky = made_sky(rng, sun, backdrop)
