@@ -6,6 +6,7 @@ The archives are described in research/worlds/shards.py; reading them needs noth
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import json
 import tarfile
@@ -68,15 +69,27 @@ class RoomView:
 
 @dataclasses.dataclass(frozen=True)
 class Rooms:
-    """Views of made rooms as a source; they are read when they are drawn."""
+    """Views of made rooms as a source; they are read when they are drawn.
+
+    All rooms are equally frequent, however many views they have: views of one room are alike.
+    """
 
     views: Sequence[RoomView]
     turning: Turning = MADE
     mingles: float = 0.2
 
+    @functools.cached_property
+    def views_by_room(self) -> list[list[RoomView]]:
+        """The views of each room."""
+        found: dict[tuple[Path, str], list[RoomView]] = {}
+        for view in self.views:
+            found.setdefault((view.archive, view.key), []).append(view)
+        return list(found.values())
+
     def draw(self, rng: Rng) -> tuple[str, Frame]:
         """As `mixture.Source` has it."""
-        view = self.views[int(rng.integers(len(self.views)))]
+        room = self.views_by_room[int(rng.integers(len(self.views_by_room)))]
+        view = room[int(rng.integers(len(room)))]
         return f"room {view.name}", view.read()
 
 

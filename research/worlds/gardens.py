@@ -17,7 +17,7 @@ from worlds.library import Library
 from worlds.meshes import box, joined, quad
 from worlds.outdoors import KERB_M, PEOPLE, Scene, daylight, eye_height, held_camera
 from worlds.placing import Box
-from worlds.plans import OpenPlan
+from worlds.plans import OUTDOORS, WorldPlan
 from worlds.planting import TREES_OF_CLIMATES, fence, hedge, plant
 from worlds.shell import material_of
 from worlds.viewpoints import Viewpoint
@@ -40,7 +40,7 @@ FLOWERS = (
 )
 
 
-def garden(rng: Rng, library: Library, cache: Path) -> OpenPlan:
+def garden(rng: Rng, library: Library, cache: Path) -> WorldPlan:
     """A garden that ends at a house: its triangles, light, cameras, and the models in it.
 
     The garden lies around x = 0; the house stands at its far end, at y = `depth`, and the camera
@@ -123,7 +123,8 @@ def garden(rng: Rng, library: Library, cache: Path) -> OpenPlan:
         azimuth = math.atan2(depth - y, target_x - x)
         return held_camera(camera_rng, eye, azimuth, height_px, width_px, pitch=-0.07)
 
-    return OpenPlan(
+    return WorldPlan(
+        OUTDOORS,
         kind="garden",
         mesh=joined(scene.parts),
         pictures=scene.pictures,

@@ -1,4 +1,4 @@
-"""Make worlds: rooms, streets or tracks as photos with depth, and six more views of each.
+"""Make worlds: rooms, streets or tracks as photos with depth, and up to six more views of each.
 
     PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 1000 --photos PHOTOS
     PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 500 --kind streets
@@ -7,8 +7,10 @@ The names of archives with streets and gardens begin with `streets-`, those with
 `tracks-`. Rooms and streets are made of the first set of models, which `worlds.fetch` gets; tracks
 of the second set, which `worlds.torcs` gets and whose terms are others; see README.md.
 
-A world depends on the seed and its number alone. The command goes on where it was stopped; archives
-that are there are kept. Two processes share the work by `--part 1/2` and `--part 2/2`.
+A world depends on the seed, its number and the number of its views alone. `--views 1` makes the
+photo alone, which is all that depth is learned from: more worlds in the same time. The command goes
+on where it was stopped; archives that are there are kept. Two processes share the work by
+`--part 1/2` and `--part 2/2`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,40 +34,32 @@ from worlds.caster import World
 from worlds.fetch import cache_folder, open_library
 from worlds.furniture import Furniture
 from worlds.library import Library
-from worlds.photo_camera import BALANCED, choose_development, photographed
+from worlds.photo_camera import Development, choose_development, photographed
 from worlds.photo_camera import developed as develop
-from worlds.plans import OpenPlan
-from worlds.rooms import DrawPhoto, WorldPlan, furnish
+from worlds.plans import WorldPlan
+from worlds.rooms import DrawPhoto, furnish
 from worlds.shards import ROOMS_PREFIX, WORLDS_PER_SHARD, pack_world, shard_file, write_shard
 from worlds.streets import street_or_garden
 from worlds.torcs import open_torcs
 from worlds.tracks import track
 from worlds.viewpoints import (
     CANDIDATES,
+    SECOND_VIEWS,
     Viewpoint,
     best_viewpoint,
-    choose_viewpoint,
     pixel_grid,
     second_cameras,
 )
-from worlds.views import COARSE_M, VALID, render
+from worlds.views import VALID, View, render
 
 Rng = np.random.Generator
 SIZE = (336, 448)  # height and width of pictures
 UPRIGHT = 0.25  # share of worlds whose photo is upright
 ATTEMPTS = 20  # how many rooms or places are tried until one shows enough
-# Least share of a photo whose pixels show a surface that is not behind glass: of rooms; and in the
-# open, where the sky is no surface.
-MIN_KNOWN = 0.6
-OPEN_MIN_KNOWN = 0.5
-# In the open: range of the share of the light's cast that white balance takes away.
-OPEN_BALANCED = (0.05, 0.45)
-OPEN_NEAR_M = 0.8  # in the open: nearer things fill the picture
-VERSION = 2  # increases whenever the same seed gives other rooms
-OPEN_VERSION = 2  # increases whenever the same seed gives other streets, gardens or tracks
+VERSION = 2  # increases whenever the same seed gives other worlds
 # How the names of archives begin, by the kind of worlds in them.
 PREFIXES = {"rooms": ROOMS_PREFIX, "streets": "streets", "tracks": "tracks"}
-DrawPlan = Callable[[Rng], OpenPlan]  # gives a random street, garden or track
+DrawPlan = Callable[[Rng], WorldPlan]  # gives a random room, street, garden or track
 
 
 class PackedWorld(NamedTuple):
@@ -99,131 +93,96 @@ def photos_of(folder: Path | None) -> DrawPhoto | None:
 
 
 def make_world(
-    furniture: Furniture,
-    cache: Path,
-    photo: DrawPhoto | None,
-    seed: int,
-    number: int,
-    size: tuple[int, int] = SIZE,
-) -> PackedWorld:
-    """A furnished room, packed.
-
-    Args:
-        furniture: models by group.
-        cache: the folder in which drawn textures of surfaces are kept.
-        photo: gives photos for picture frames and windows; None: there are none.
-        seed, number: determine the world.
-        size: height and width in pixels, swapped in upright photos.
-
-    Raises:
-        InputError: no room in a row of `ATTEMPTS` shows enough.
-    """
-    for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([VERSION, seed, number, attempt])
-        height, width = size if rng.random() >= UPRIGHT else size[::-1]
-        plan = furnish(rng, furniture, cache, photo)
-        world = World(plan.mesh, plan.pictures)
-        viewpoint = choose_viewpoint(rng, plan.place, world, height, width)
-        if viewpoint is None:
-            continue
-        packed = _packed_world(rng, world, viewpoint, plan, seed, number, MIN_KNOWN, COARSE_M)
-        if packed is not None:
-            return packed
-    raise InputError(f"world {number}: {ATTEMPTS} rooms in a row show too little")
-
-
-def make_open_world(
     draw: DrawPlan,
     library: Library,
     seed: int,
     number: int,
     size: tuple[int, int] = SIZE,
+    second_views: int = SECOND_VIEWS,
 ) -> PackedWorld:
-    """A street, garden or track, packed.
+    """A room, street, garden or track, packed: its photo and second views.
 
     Args:
         draw: gives a random one.
-        library: the models it is made of; the world's JSON names their creators and licences.
+        library: the models it is made of.
         seed, number: determine the world.
         size: height and width in pixels, swapped in upright photos.
+        second_views: how many views there are besides the photo's, at most `SECOND_VIEWS`.
 
     Raises:
-        InputError: no place in a row of `ATTEMPTS` shows enough.
+        InputError: no world in a row of `ATTEMPTS` shows enough.
     """
-    entries = {model.entry.key: model.entry for model in library.models}
     for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([OPEN_VERSION, seed, number, attempt])
+        rng = np.random.default_rng([VERSION, seed, number, attempt])
         height, width = size if rng.random() >= UPRIGHT else size[::-1]
         plan = draw(rng)
         world = World(plan.mesh, plan.pictures)
         candidates = [plan.draw_viewpoint(rng, height, width) for _ in range(CANDIDATES)]
-        viewpoint = best_viewpoint(world, candidates, OPEN_NEAR_M)
+        viewpoint = best_viewpoint(world, candidates, plan.setting.near_m)
         if viewpoint is None:
             continue
-        # Who asks for attribution, and under which terms.
-        used = [entries[key] for key in plan.models]
-        facts = {
-            "version": OPEN_VERSION,
-            "creators": sorted({one.creator for one in used if one.creator}),
-            "licences": sorted({one.licence for one in used}),
-        }
-        packed = _packed_world(
-            rng, world, viewpoint, plan, seed, number, OPEN_MIN_KNOWN, plan.coarse_m, facts
+        pictures = _pictures(rng, world, viewpoint, plan, second_views)
+        if pictures is None:
+            continue
+        facts = {"version": VERSION, "seed": seed, "number": number}
+        facts |= _facts(plan, library) | {"trajectories": pictures.trajectories}
+        data = pack_world(
+            f"{seed:02d}-{number:06d}", pictures.photo, pictures.views, pictures.settings, facts
         )
-        if packed is not None:
-            return packed
-    raise InputError(f"world {number}: {ATTEMPTS} places in a row show too little")
+        return PackedWorld(data, len(pictures.views))
+    raise InputError(f"world {number}: {ATTEMPTS} in a row show too little")
 
 
-def _packed_world(
-    rng: Rng,
-    world: World,
-    viewpoint: Viewpoint,
-    plan: WorldPlan | OpenPlan,
-    seed: int,
-    number: int,
-    min_known: float,
-    coarse_m: float,
-    more_facts: Mapping[str, Any] | None = None,
-) -> PackedWorld | None:
-    """A world, rendered and packed; None if its photo shows too few surfaces.
+class Pictures(NamedTuple):
+    """All pictures of a world."""
+
+    photo: bytes  # a JPEG, as a real camera would have taken it
+    views: list[View]  # the photo's view without the camera's faults, then the second views
+    settings: Development  # the camera's, which all views share
+    trajectories: list[str]  # along which path of the package each second camera lies
+
+
+def _pictures(
+    rng: Rng, world: World, viewpoint: Viewpoint, plan: WorldPlan, second_views: int
+) -> Pictures | None:
+    """The pictures of a world; None if its photo shows too few surfaces.
 
     Args:
         rng: for second cameras, rays and the photo's settings.
         world: the plan's triangles.
         viewpoint: the photo's camera.
         plan: what the world consists of, with its light.
-        seed, number: those that the world is made by; they become its key, such as "00-000012".
-        min_known: least share of the photo that shows surfaces which are not behind glass.
-        coarse_m: width in metres of the coarse cells on which surfaces light each other; see
-            `views.render`.
-        more_facts: what else its JSON says; the version there replaces that of rooms.
+        second_views: how many views there are besides the photo's.
     """
     camera = viewpoint.camera
     pixels = pixel_grid(camera.height, camera.width)
     hits = world.first_hits(*viewpoint.rays(camera, pixels))
     known = hits.triangle >= 0
     # Looked at before rendering, which takes long; what is behind glass is only known after it.
-    if known.mean() < min_known:
+    if known.mean() < plan.setting.min_known:
         return None
-    cameras, names = second_cameras(rng, world, viewpoint, hits.distance[known])
-    views = render(rng, world, plan.lights, viewpoint, [camera, *cameras], coarse_m)
-    if (views[0].valid == VALID).mean() < min_known:
+    cameras, trajectories = second_cameras(rng, world, viewpoint, hits.distance[known])
+    chosen = [camera, *cameras[:second_views]]
+    views = render(rng, world, plan.lights, viewpoint, chosen, plan.coarse_m)
+    if (views[0].valid == VALID).mean() < plan.setting.min_known:
         return None
-    balanced = OPEN_BALANCED if isinstance(plan, OpenPlan) else BALANCED
-    settings = choose_development(rng, views[0].radiance, balanced)
-    jpeg = photographed(rng, develop(views[0].radiance, settings), settings)
-    facts = {
-        "version": VERSION,
-        "seed": seed,
-        "number": number,
+    settings = choose_development(rng, views[0].radiance, plan.setting.balanced)
+    photo = photographed(rng, develop(views[0].radiance, settings), settings)
+    return Pictures(photo, views, settings, trajectories[:second_views])
+
+
+def _facts(plan: WorldPlan, library: Library) -> dict[str, Any]:
+    """What a world's JSON says of its content, with the creators and terms of its models."""
+    entries = {model.entry.key: model.entry for model in library.models}
+    # Bookcases that `shell.made_shelf` builds are no one else's, so the library lacks them.
+    used = [entries[key] for key in plan.models if key in entries]
+    return {
         "kind": plan.kind,
         "models": list(plan.models),
         "triangles": plan.mesh.count,
-        "trajectories": names,
-    } | dict(more_facts or {})
-    key = f"{seed:02d}-{number:06d}"
-    return PackedWorld(pack_world(key, jpeg, views, settings, facts), len(views))
+        "creators": sorted({one.creator for one in used if one.creator}),
+        "licences": sorted({one.licence for one in used}),
+    }
 
 
 def make_shards(
@@ -265,7 +224,9 @@ def make_shards(
         )
 
 
-def _maker_of_kind(kind: str, cache: Path, photo: DrawPhoto | None, seed: int) -> MakeWorld:
+def _maker_of_kind(
+    kind: str, cache: Path, photo: DrawPhoto | None, seed: int, second_views: int
+) -> MakeWorld:
     """The function that makes worlds of a kind, each by its number.
 
     It opens the library of the kind's models, which is fetched first if it is missing.
@@ -275,17 +236,18 @@ def _maker_of_kind(kind: str, cache: Path, photo: DrawPhoto | None, seed: int) -
         cache: the folder in which models and drawn textures are kept.
         photo: gives photos for rooms, or None.
         seed: determines the worlds, together with their numbers.
+        second_views: how many views a world has besides the photo's.
     """
-    if kind == "rooms":
-        furniture = Furniture(open_library(cache))
-        return lambda number: make_world(furniture, cache, photo, seed, number)
     library = open_torcs(cache) if kind == "tracks" else open_library(cache)
+    furniture = Furniture(library) if kind == "rooms" else None
 
-    def draw(rng: Rng) -> OpenPlan:
-        """A random track, or a random street or garden."""
+    def draw(rng: Rng) -> WorldPlan:
+        """A random world of the kind."""
+        if furniture is not None:
+            return furnish(rng, furniture, cache, photo)
         return track(rng, library) if kind == "tracks" else street_or_garden(rng, library, cache)
 
-    return lambda number: make_open_world(draw, library, seed, number)
+    return lambda number: make_world(draw, library, seed, number, second_views=second_views)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -300,15 +262,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--worlds", type=int, default=48, help="how many there shall be")
     parser.add_argument("--photos", type=Path, help="photos for frames and windows")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--views",
+        type=int,
+        choices=range(1, SECOND_VIEWS + 2),
+        default=SECOND_VIEWS + 1,
+        help="of each world, the photo's included; 1 is enough to learn depth from",
+    )
     parser.add_argument("--cache", type=Path, help="where models are kept")
     parser.add_argument("--part", default="1/1", help="1/2: the first of two processes")
     options = parser.parse_args(arguments)
     try:
         which, parts = (int(word) for word in options.part.split("/"))
         cache = cache_folder(options.cache)
-        make = _maker_of_kind(options.kind, cache, photos_of(options.photos), options.seed)
+        make = _maker_of_kind(
+            options.kind, cache, photos_of(options.photos), options.seed, options.views - 1
+        )
         make_folder(options.output)
-        with file_lock(options.output / f".part-{which}.lock"):
+        with file_lock(options.output / f".{PREFIXES[options.kind]}-{which}.lock"):
             make_shards(
                 options.output,
                 make,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -326,10 +326,6 @@ def held_camera(
 def eye_height(rng: Rng) -> float:
     """Metres of a camera above the ground: of one who stands in 80 %, of one who stoops in 20 %."""
     return float(rng.uniform(1.35, 1.75) if rng.random() < 0.8 else rng.uniform(0.6, 1.3))
-
-
-# Draws a random camera: called with a generator, and the picture's height and width in pixels.
-DrawViewpoint = Callable[[Rng, int, int], Viewpoint]
 
 
 def plain(color: Sequence[float], specular: float = 0.0, roughness: float = 1.0) -> Material:

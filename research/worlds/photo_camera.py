@@ -15,7 +15,6 @@ from worlds.pictures import linear_to_srgb
 Rng = np.random.Generator
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
-BALANCED = (0.4, 0.95)  # range of the share of a light's cast that white balance takes away
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,9 +32,7 @@ class Development:
     jpeg: int  # quality
 
 
-def choose_development(
-    rng: Rng, radiance: Floats, balanced: tuple[float, float] = BALANCED
-) -> Development:
+def choose_development(rng: Rng, radiance: Floats, balanced: tuple[float, float]) -> Development:
     """Settings of a camera that meters a view [H, W, 3], and is not always right.
 
     `balanced` is the range of the share of a cast that white balance takes away. In the open it is

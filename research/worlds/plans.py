@@ -1,4 +1,4 @@
-"""What a world in the open consists of, ready for the caster."""
+"""What a world consists of, ready for the caster."""
 
 from __future__ import annotations
 
@@ -9,17 +9,35 @@ from numpy.typing import NDArray
 
 from worlds.lights import Lights
 from worlds.meshes import Mesh
-from worlds.outdoors import DrawViewpoint
+from worlds.viewpoints import MIN_NEAR_M, DrawViewpoint
 
 
 @dataclasses.dataclass(frozen=True)
-class OpenPlan:
-    """A street, garden or track: its triangles, its light, and from where it is photographed.
+class Setting:
+    """What all worlds indoors, or all worlds in the open, have in common."""
+
+    # Least share of a photo whose pixels show a surface that is not behind glass; in the open the
+    # sky is no surface.
+    min_known: float
+    # No camera is held nearer to a thing than this, in metres: it would fill the picture.
+    near_m: float
+    # Range of the share of the light's colour cast that the camera's white balance takes away.
+    balanced: tuple[float, float]
+
+
+INDOORS = Setting(min_known=0.6, near_m=MIN_NEAR_M, balanced=(0.4, 0.95))
+OUTDOORS = Setting(min_known=0.5, near_m=0.8, balanced=(0.05, 0.45))
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldPlan:
+    """A room, street, garden or track: its triangles, its light, from where it is photographed.
 
     Coordinates are metres with z up.
     """
 
-    kind: str  # "town street", "suburban street", "garden" or "track"; told in the world's JSON
+    setting: Setting
+    kind: str  # "kitchen", "town street", "garden", "track" and others; told in the world's JSON
     mesh: Mesh  # all triangles, with their materials
     # Textures that are no files, [H, W, 3] or [H, W, 4], by the name that materials give.
     pictures: dict[str, NDArray[np.uint8]]

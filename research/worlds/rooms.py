@@ -15,6 +15,7 @@ Then every room gets bookcases, plants, lamps, pictures, clutter, and sometimes 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +28,7 @@ from worlds.furniture import Furniture
 from worlds.lights import Lights, direction_to_sun, made_sky
 from worlds.meshes import Material, Mesh, box, joined, quad, rotation_z
 from worlds.placing import WALLS, Box, Opening, Place, Placed, WallName
+from worlds.plans import INDOORS, WorldPlan
 from worlds.shell import (
     WALL_M,
     WHITE,
@@ -41,6 +43,8 @@ from worlds.shell import (
     window_frame,
 )
 from worlds.surfaces import Surface, surfaces
+from worlds.viewpoints import indoor_viewpoint
+from worlds.views import COARSE_M
 
 Rng = np.random.Generator
 Bytes = NDArray[np.uint8]
@@ -51,18 +55,6 @@ KIND_SHARES = (0.26, 0.15, 0.15, 0.12, 0.12, 0.06, 0.07, 0.07)
 NEUTRAL_SATURATION = 0.12  # a colour with less is grey: no one chose it
 SKIN_SHARE = 0.75  # of the grey materials of furniture get another colour or a texture
 SOFT_GROUPS = ("sofa", "armchair", "bed", "kids_bed")
-
-
-@dataclasses.dataclass(frozen=True)
-class WorldPlan:
-    """All that a world consists of, ready for the caster."""
-
-    kind: str
-    mesh: Mesh
-    pictures: dict[str, Bytes]  # made textures by name
-    lights: Lights
-    place: Place
-    models: tuple[str, ...]  # keys of the models in it, for attribution
 
 
 class Builder:
@@ -150,7 +142,16 @@ def furnish(rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None
     for number, thing in enumerate(room.place.things):
         room.parts.append(_mesh_of(room, thing, number in room.lit))
     keys = sorted({thing.model.entry.key for thing in room.place.things})
-    return WorldPlan(room.kind, joined(room.parts), room.pictures, lights, room.place, tuple(keys))
+    return WorldPlan(
+        INDOORS,
+        kind=room.kind,
+        mesh=joined(room.parts),
+        pictures=room.pictures,
+        lights=lights,
+        draw_viewpoint=functools.partial(indoor_viewpoint, room.place),
+        models=tuple(keys),
+        coarse_m=COARSE_M,
+    )
 
 
 def _living(room: Builder) -> None:

@@ -24,7 +24,7 @@ from worlds.library import Library
 from worlds.meshes import Faces, Material, Mesh, joined, quad, rotation_z
 from worlds.outdoors import KERB_M, PEOPLE, Scene, daylight, eye_height, held_camera, plain
 from worlds.placing import Box
-from worlds.plans import OpenPlan
+from worlds.plans import OUTDOORS, WorldPlan
 from worlds.planting import SHRUBS, TREES_OF_CLIMATES, border, hedge, plant
 from worlds.shell import material_of
 from worlds.viewpoints import Viewpoint
@@ -56,7 +56,7 @@ class Layout:
         return self.half_road_m + self.pavement_m
 
 
-def street_or_garden(rng: Rng, library: Library, cache: Path) -> OpenPlan:
+def street_or_garden(rng: Rng, library: Library, cache: Path) -> WorldPlan:
     """A street in three of four cases, otherwise a garden: its triangles, light and cameras.
 
     Args:
@@ -68,7 +68,7 @@ def street_or_garden(rng: Rng, library: Library, cache: Path) -> OpenPlan:
     return street(rng, library, cache) if rng.random() < 0.75 else garden(rng, library, cache)
 
 
-def street(rng: Rng, library: Library, cache: Path) -> OpenPlan:
+def street(rng: Rng, library: Library, cache: Path) -> WorldPlan:
     """A street: its triangles, light, cameras, and the models in it.
 
     The street runs along y with the middle of its road at x = 0; x is across it, z up, in metres.
@@ -124,7 +124,8 @@ def street(rng: Rng, library: Library, cache: Path) -> OpenPlan:
         azimuth = math.pi / 2 + float(turn)  # π / 2 is +y
         return held_camera(camera_rng, eye, azimuth, height_px, width_px)
 
-    return OpenPlan(
+    return WorldPlan(
+        OUTDOORS,
         kind="town street" if town else "suburban street",
         mesh=joined(scene.parts),
         pictures=scene.pictures,

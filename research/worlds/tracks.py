@@ -25,7 +25,7 @@ from worlds.lights import cloud_noise
 from worlds.meshes import Material, Mesh, joined
 from worlds.outdoors import daylight, held_camera
 from worlds.pictures import load_picture
-from worlds.plans import OpenPlan
+from worlds.plans import OUTDOORS, WorldPlan
 from worlds.torcs import CAR, TRACK
 from worlds.viewpoints import Viewpoint
 
@@ -58,7 +58,7 @@ class TrianglePoint(NamedTuple):
     weights: NDArray[np.float64]  # [3] of its corners; their mean with these weights is the point
 
 
-def track(rng: Rng, library: Library) -> OpenPlan:
+def track(rng: Rng, library: Library) -> WorldPlan:
     """A random place at a race track, with cars, its light, and a source of cameras.
 
     Args:
@@ -132,7 +132,8 @@ def track(rng: Rng, library: Library) -> OpenPlan:
             azimuth += math.copysign(own.uniform(0.1, 0.8), -left)
         return held_camera(own, eye, azimuth, height, width_px)
 
-    return OpenPlan(
+    return WorldPlan(
+        OUTDOORS,
         kind="track",
         mesh=joined(parts),
         pictures=pictures,

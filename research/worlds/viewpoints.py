@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,25 +53,18 @@ class Viewpoint:
         )
 
 
+# Draws a random camera: called with a generator, and the picture's height and width in pixels.
+DrawViewpoint = Callable[[Rng, int, int], Viewpoint]
+
+
 def pixel_grid(height: int, width: int) -> Floats:
     """[H · W, 2] x and y of all pixel centres, row by row."""
     y, x = np.mgrid[:height, :width] + 0.5
     return np.stack([x.reshape(-1), y.reshape(-1)], -1).astype(np.float32)
 
 
-def choose_viewpoint(
-    rng: Rng, place: Place, world: World, height: int, width: int
-) -> Viewpoint | None:
-    """The best of some random cameras in a room: near and far things, not one wall alone.
-
-    None if all of them stand in furniture.
-    """
-    candidates = [_random_viewpoint(rng, place, height, width) for _ in range(CANDIDATES)]
-    return best_viewpoint(world, candidates)
-
-
 def best_viewpoint(
-    world: World, candidates: Sequence[Viewpoint], near_m: float = MIN_NEAR_M
+    world: World, candidates: Sequence[Viewpoint], near_m: float
 ) -> Viewpoint | None:
     """The camera that shows the most surfaces at the most depths; None if all are blocked.
 
@@ -85,8 +78,14 @@ def best_viewpoint(
     return candidates[best] if scores[best] > 0 else None
 
 
-def _random_viewpoint(rng: Rng, place: Place, height: int, width: int) -> Viewpoint:
-    """A camera at some height, held a little crooked, that looks at a thing or across the room."""
+def indoor_viewpoint(place: Place, rng: Rng, height: int, width: int) -> Viewpoint:
+    """A camera at some height, held a little crooked, that looks at a thing or across the room.
+
+    Args:
+        place: the room.
+        rng: draws all of it.
+        height, width: of the picture in pixels.
+    """
     # 24 to 70 mm; phones have 24 to 28 mm. The exponent makes short ones more frequent.
     focal_mm = 24 * (70 / 24) ** (rng.random() ** 1.6)
     camera = Camera.from_focal(focal_mm_to_px(focal_mm, width, height), width, height)

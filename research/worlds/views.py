@@ -65,7 +65,7 @@ def render(
     lights: Lights,
     viewpoint: Viewpoint,
     cameras: list[Camera],
-    coarse_m: float = COARSE_M,
+    coarse_m: float,
 ) -> list[View]:
     """The views of a world from several cameras, in their order, all with the same light.
 

@@ -17,6 +17,8 @@ from worlds.furniture import Furniture
 from worlds.library import Library
 from worlds.make import PackedWorld, make_shards, make_world
 from worlds.placing import Box, Opening, Place
+from worlds.plans import WorldPlan
+from worlds.rooms import furnish
 from worlds.shards import read_view, shard_file, world_facts, world_keys, write_shard
 
 pytestmark = pytest.mark.slow
@@ -45,16 +47,26 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
+def make_room(furniture: Furniture, cache: Path, number: int, second_views: int = 6) -> PackedWorld:
+    """A packed room of boxes."""
+
+    def draw(rng: np.random.Generator) -> WorldPlan:
+        """A random room without photos on its walls."""
+        return furnish(rng, furniture, cache, None)
+
+    return make_world(draw, furniture.library, 3, number, SIZE, second_views)
+
+
 @functools.cache
 def packed(furniture: Furniture, cache: Path, number: int) -> bytes:
     """A packed world of boxes."""
-    return make_world(furniture, cache, None, 3, number, SIZE)[0]
+    return make_room(furniture, cache, number)[0]
 
 
 def test_the_same_number_gives_the_same_bytes_and_another_one_others(
     furniture: Furniture, cache: Path
 ) -> None:
-    again, count = make_world(furniture, cache, None, 3, 0, SIZE)
+    again, count = make_room(furniture, cache, 0)
     assert count == 7
     assert again == packed(furniture, cache, 0)
     assert again != packed(furniture, cache, 1)
@@ -100,6 +112,21 @@ def test_facts_name_models_trajectories_and_known_share(
     assert len(facts["trajectories"]) == 6
     assert all(name.startswith(("Boxes#", "made#")) for name in facts["models"])
     assert all(0 <= view["known"] <= 1 for view in facts["views"])
+
+
+def test_a_world_of_one_view_has_the_photo_alone(
+    furniture: Furniture, cache: Path, tmp_path: Path
+) -> None:
+    alone, count = make_room(furniture, cache, 0, second_views=0)
+    assert count == 1
+    shard = shard_file(tmp_path, 0)
+    write_shard(shard, [alone])
+    whole = shard_file(tmp_path, 1)
+    write_shard(whole, [packed(furniture, cache, 0)])
+    (key,) = world_keys(shard)
+    # The same camera sees the same surfaces.
+    np.testing.assert_array_equal(read_view(shard, key, 0).depth, read_view(whole, key, 0).depth)
+    assert len(world_facts(shard, key)["views"]) == 1
 
 
 def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
@@ -178,7 +205,9 @@ def test_outlines_are_mixed_and_depth_is_not(furniture: Furniture, cache: Path) 
     axes = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
     viewpoint = Viewpoint(np.zeros(3, np.float32), axes, Camera.from_focal(20.0, 16, 8))
     dark = lights(sky=np.zeros((4, 8, 3), np.float32))
-    (view,) = views.render(np.random.default_rng(0), world, dark, viewpoint, [viewpoint.camera])
+    (view,) = views.render(
+        np.random.default_rng(0), world, dark, viewpoint, [viewpoint.camera], views.COARSE_M
+    )
     # The outline is at 0.3 pixels right of the middle.
     row = view.radiance[4, :, 0]
     assert row[7] < 0.1

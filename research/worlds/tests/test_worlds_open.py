@@ -19,10 +19,10 @@ from worlds.caster import World
 from worlds.gardens import garden
 from worlds.houses import Hole, choose_style, holed_wall, house, leafy, pole
 from worlds.library import Library
-from worlds.make import PackedWorld, make_open_world, make_shards
+from worlds.make import PackedWorld, make_shards, make_world
 from worlds.meshes import Faces, Material, Mesh, box, face_normals, joined, quad
 from worlds.outdoors import Scene, repainted, thinned
-from worlds.plans import OpenPlan
+from worlds.plans import WorldPlan
 from worlds.shards import read_view, world_facts, world_keys, write_shard
 from worlds.streets import street
 from worlds.torcs import COPYRIGHT, FREE_ART, GAME, GPL, convert
@@ -426,7 +426,7 @@ def test_things_stand_apart_and_models_are_named(
 ) -> None:
     assert callable(rules)
     plan = rules(np.random.default_rng(5), outdoor_library, cache)
-    assert isinstance(plan, OpenPlan)
+    assert isinstance(plan, WorldPlan)
     assert plan.models
     assert all(name.startswith("Boxes#") for name in plan.models)
     scene = Scene(np.random.default_rng(0), outdoor_library, cache)
@@ -440,12 +440,12 @@ def test_things_stand_apart_and_models_are_named(
 def test_the_same_number_gives_the_same_open_world_with_licences(
     outdoor_library: Library, cache: Path, tmp_path: Path
 ) -> None:
-    def draw(rng: np.random.Generator) -> OpenPlan:
+    def draw(rng: np.random.Generator) -> WorldPlan:
         """A street of boxes."""
         return street(rng, outdoor_library, cache)
 
-    made, count = make_open_world(draw, outdoor_library, 3, 0, SIZE)
-    again, _ = make_open_world(draw, outdoor_library, 3, 0, SIZE)
+    made, count = make_world(draw, outdoor_library, 3, 0, SIZE)
+    again, _ = make_world(draw, outdoor_library, 3, 0, SIZE)
     assert count == 7
     assert made == again
     path = tmp_path / "streets-00000.tar"
@@ -483,11 +483,11 @@ def test_a_track_has_its_road_under_the_camera_and_names_its_terms(
     sides = face_normals(mesh.corners[road])
     assert np.linalg.norm(sides, axis=1).sum() / 2 == pytest.approx(9 * 400)
 
-    def draw(rng: np.random.Generator) -> OpenPlan:
+    def draw(rng: np.random.Generator) -> WorldPlan:
         """A place at the only track."""
         return track(rng, torcs)
 
-    data, _ = make_open_world(draw, torcs, 1, 0, SIZE)
+    data, _ = make_world(draw, torcs, 1, 0, SIZE)
     path = tmp_path / "tracks-00000.tar"
     write_shard(path, [data])
     facts = world_facts(path, world_keys(path)[0])
