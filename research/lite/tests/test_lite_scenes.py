@@ -241,6 +241,16 @@ def test_a_score_knows_neither_scale_nor_shift() -> None:
         assert score.delta == 1
 
 
+def test_what_is_farther_than_ten_medians_does_not_count() -> None:
+    depth = torch.tensor([[1.0, 2.0, 3.0, 2.0, 29.0]])  # the median is 2: 20 and more do not count
+    valid = torch.ones(1, 5, dtype=torch.bool)
+    guess = 1 / depth
+    guess[0, 4] = 1.0  # as near as the nearest
+    assert score_depth(guess, depth, valid).abs_rel == pytest.approx(0, abs=1e-6)
+    depth[0, 4] = 19.0
+    assert score_depth(guess, depth, valid).abs_rel > 0.1
+
+
 def test_a_score_by_hand() -> None:
     """Half is at 1 m, half at 2 m: a constant guess is aligned to 4/3 m."""
     depth = torch.tensor([[1.0, 1.0], [2.0, 2.0]])
