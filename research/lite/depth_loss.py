@@ -112,8 +112,8 @@ def _median(x: Tensor, valid: Tensor) -> Tensor:
     return torch.stack(values)[:, None, None]
 
 
-# Surfaces farther than this multiple of the median depth do not count. A camera's step moves them by
-# less than a tenth of what it moves the picture's middle, but the horizon of a street, 60 times the
+# Surfaces farther than this multiple of the median depth do not count. A camera's step moves them
+# by less than a tenth of what it moves the picture's middle; the horizon of a street, 60 times the
 # median, would decide the mean of all errors. No photo with measured depth has any.
 FARTHEST_COUNTED = 10.0
 FARTHEST_FACTOR = 2.0  # upper bound of an aligned depth, as multiple of the farthest true depth
