@@ -394,12 +394,40 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-def test_outdoor_textures_repeat_without_a_seam(tmp_path: Path) -> None:
-    for kind in outdoor_surfaces.OUTDOOR_KINDS:
+def seam_ratio(picture: np.ndarray) -> float:
+    """How strong a picture's seam is: near 1 or below if it repeats without one.
+
+    It is the difference of the first and last column, over the largest difference of two columns
+    side by side; or that of rows if this is larger. `picture` is [H, W, 3].
+    """
+    ratios = []
+    for axis in (0, 1):
+        steps = np.abs(np.roll(picture, -1, axis) - picture).mean((1 - axis, 2))
+        ratios.append(steps[-1] / steps[:-1].max())
+    return max(ratios)
+
+
+def test_textures_repeat_without_a_seam(tmp_path: Path) -> None:
+    ratios = {}
+    for kind in [*surfaces.KINDS, *outdoor_surfaces.OUTDOOR_KINDS]:
         one = outdoor_surfaces.outdoor_surfaces(tmp_path, kind)[0]
         picture = np.asarray(Image.open(one.file), np.float64)
         assert picture.shape == (64, 64, 3)
         assert 0.1 < one.tile_m < 6
+        ratios[kind] = seam_ratio(picture)
+    del ratios["panes"]  # laid over a window once, so that they need not repeat
+    assert max(ratios.values()) < 2, ratios
+    # What has a seam is found: a ramp that gets lighter by 1 from pixel to pixel, along both sides.
+    ramp = np.repeat(np.indices((64, 64)).sum(0)[..., None], 3, 2)
+    assert seam_ratio(ramp) == pytest.approx(63)
+
+
+def test_size_and_gloss_are_the_same_without_the_picture() -> None:
+    for draw in [*surfaces.KINDS.values(), *outdoor_surfaces.OUTDOOR_KINDS.values()]:
+        with_picture = draw(np.random.default_rng(3), True)
+        without = draw(np.random.default_rng(3), False)
+        assert with_picture.picture is not None
+        assert without == with_picture._replace(picture=None)
 
 
 def test_a_house_stands_in_its_place_with_its_roof_above(cache: Path) -> None:
