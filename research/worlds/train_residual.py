@@ -13,7 +13,6 @@ worlds are then mixed.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import itertools
 import sys
@@ -24,6 +23,7 @@ from typing import Annotated
 import torch
 from pydantic import Field
 
+from spackle.cli.training_command import run_training_command
 from spackle.paper.training.measured_photos import find_files
 from spackle.paper.training.recipe import (
     MAY_CHANGE_ON_RESUME,
@@ -31,17 +31,14 @@ from spackle.paper.training.recipe import (
     DataRecipe,
     Recipe,
     RecipePart,
-    load_recipe,
 )
 from spackle.paper.training.residual import CACHE, ResidualTask, StoredCrops
 from spackle.paper.training.sample_factory import SAMPLES_VERSION, make_samples, short_digest
-from spackle.paper.training.train import train
 from spackle.render import Renderer
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Reporter
 from worlds.second_views import DEPTH_KINDS, DepthKind, second_view_source
 
-INTERRUPTED = 130  # the exit status of a run that was stopped by a signal
 VIEWS_VERSION = 1  # increases whenever the same worlds would give other training views
 
 
@@ -193,33 +190,14 @@ def mixed(usual: Sequence[Path], worlds: Sequence[Path], share: float) -> list[P
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status: 0, 2 for bad input, 130 for a stopped run."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    return run_training_command(
+        WorldsRecipe,
+        WorldsTask,
+        arguments,
+        description=__doc__,
+        recipe_help="a recipe's name or file, as for `spackle train`",
+        overrides_help="settings of the recipe, such as worlds.share=0.5",
     )
-    parser.add_argument(
-        "--recipe", type=Path, required=True, help="a recipe's name or file, as for `spackle train`"
-    )
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, help="a folder; a run in it goes on"
-    )
-    parser.add_argument(
-        "--overwrite", action="store_true", help="start anew where the folder holds a run"
-    )
-    parser.add_argument(
-        "overrides",
-        nargs="*",
-        metavar="KEY=VALUE",
-        help="settings of the recipe, such as worlds.share=0.5",
-    )
-    options = parser.parse_intermixed_args(arguments)
-    try:
-        recipe = load_recipe(WorldsRecipe, options.recipe, options.overrides)
-        ended = train(recipe, WorldsTask, options.output, Reporter(), options.overwrite)
-    except InputError as error:
-        if str(error):  # empty if another process reports the error
-            print(f"error: {error}", file=sys.stderr)
-        return 2
-    return INTERRUPTED if ended == "stopped" else 0
 
 
 if __name__ == "__main__":

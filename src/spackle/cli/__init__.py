@@ -29,7 +29,7 @@ from spackle.cli.figures import figures
 from spackle.cli.fill import fill
 from spackle.cli.info import info
 from spackle.cli.messages import applications, with_flags, with_suggestion
-from spackle.cli.options import INTERRUPTED, PAPER_PANEL
+from spackle.cli.options import BAD_INPUT, INTERRUPTED, PAPER_PANEL
 from spackle.cli.predict import predict
 from spackle.cli.render import render
 from spackle.cli.serve import serve
@@ -40,7 +40,6 @@ from spackle.cli.view import view
 from spackle.cli.weights import weights
 from spackle.runtime.errors import InputError, printable_line
 
-BAD_INPUT = 2  # exit code after a message about the input
 # The garbage collector runs after so many new objects, not after 2,000, because each time it scans
 # the 200,000 objects of torch and numba.
 OBJECTS_BETWEEN_COLLECTIONS = 50_000

@@ -30,6 +30,7 @@ from spackle.runtime.errors import InputError, unknown_name
 if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.views import PathOptions
 
+BAD_INPUT = 2  # exit code after a message about the input
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells report it
 PAPER_PANEL = "The paper's experiments"  # where help lists the commands that repeat them
 
