@@ -28,27 +28,36 @@ from __future__ import annotations
 import argparse
 import json
 import random
-from collections.abc import Sequence
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from PIL import Image
-from scoreboard import markdown, pictures_in, sign_test
+from pydantic import BaseModel, ConfigDict, Field
+from scoreboard import markdown, sign_test
 from torch import Tensor
 
 from spackle.bases.settings import BaseSettings
-from spackle.core.color import to_uint8
+from spackle.cli.options import BAD_INPUT
+from spackle.core.image_files import read_image
 from spackle.core.photo import load_photo
+from spackle.formats import save_png
 from spackle.pipeline import FillOptions, Pipeline, PipelineOptions
-from spackle.runtime.errors import InputError
+from spackle.runtime.errors import InputError, as_input_error, printable_line
+from spackle.runtime.files import check_file, check_writable, list_files, write_atomic, write_json
+from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Reporter
+from spackle.runtime.validation import validated
 from spackle.views import PathOptions
 
 # A looped video of four frames has both ends of the move. The fill begins with the widest views, so
 # the ends look nearly as in a video of 60 frames, which takes ten times as long.
 FRAMES = 4
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png")  # of the photos that are drawn
 END_NAMES = ("left", "right")  # of the video's frames: the camera is farthest to this side
 GAP_PX = 6  # of white between the pictures of a sheet
 WHITE = 255
@@ -56,6 +65,8 @@ VERSIONS = ("old", "new")
 SIDES = ("A", "B")
 POSTED = 4  # a stranger who gives at least this rating would post the video
 PLACES = ("border", "inside")  # where a reader saw a flaw at first sight
+Version = Literal["old", "new"]
+Entry = TypeVar("Entry", bound=BaseModel)  # what a file of readers or a key says of one picture
 
 RATING_TEXT = """\
 You have taken a photo, and a program has made a short video of it in which the camera moves a
@@ -91,30 +102,72 @@ def draw(folders: Sequence[Path], count: int, seed: int) -> list[Path]:
     """`count` photos drawn at random, as nearly as possible equally many from each folder.
 
     The same folders, count and seed give the same photos.
+
+    Raises:
+        InputError: a folder cannot be read or has no photos, or the count is not positive.
     """
+    if count < 1:
+        raise InputError(f"--count {count}: must be at least 1")
     chance = random.Random(seed)
     photos: list[Path] = []
     for position, folder in enumerate(folders):
         # What is left to draw is shared equally among this folder and those after it.
         share = round((count - len(photos)) / (len(folders) - position))
-        all_names = pictures_in(folder, sum(1 for _ in folder.iterdir()))
-        photos += chance.sample(all_names, min(share, len(all_names)))
+        files = list_files(folder, PICTURE_SUFFIXES)
+        if not files:
+            suffixes = ", ".join(PICTURE_SUFFIXES)
+            raise InputError(f"{folder}: has no photo ({suffixes}): give a folder of photos")
+        photos += chance.sample(files, min(share, len(files)))
     return photos
+
+
+def read_photo_list(file: Path) -> list[Path]:
+    """The photos that a file names, one in each line; empty lines are passed over.
+
+    Raises:
+        InputError: the file cannot be read or names no photo, one of the photos is missing, or two
+            have the same name, so that their frames would have, too.
+    """
+    lines = [line for line in read_text(file, "list of photos").splitlines() if line.strip()]
+    if not lines:
+        raise InputError(f"{file}: names no photo: write the path of a photo into each line")
+    photos = [Path(line) for line in lines]
+    for photo in photos:
+        check_file(photo, "photo")
+    name, count = Counter(photo.stem for photo in photos).most_common(1)[0]
+    if count > 1:
+        raise InputError(
+            f"{file}: has {count} photos {name}, whose frames would have the same name: "
+            "rename one, or leave it out"
+        )
+    return photos
+
+
+def read_text(file: Path, kind: str) -> str:
+    """The text of a UTF-8 file; InputError, which names its kind, if it cannot be read."""
+    check_file(file, kind)
+    problem = f"cannot be read as text ({{reason}}): give a {kind}"
+    with as_input_error(file, problem, OSError, UnicodeDecodeError):
+        return file.read_text(encoding="utf-8")
 
 
 def save_ends(photos: Sequence[Path], options: PipelineOptions, folder: Path) -> None:
     """Write the two end frames of each photo's video: NAME_left.png and NAME_right.png.
 
     Photos whose frames are there already are left out.
+
+    Raises:
+        InputError: an option is out of bounds, a photo cannot be decoded, or the folder cannot be
+            written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     pipeline = Pipeline.open(options)
     for photo in photos:
         files = [folder / f"{photo.stem}_{name}.png" for name in END_NAMES]
         if all(file.is_file() for file in files):
             continue
         for file, frame in zip(files, end_frames(pipeline, photo), strict=True):
-            Image.fromarray(to_uint8(frame).numpy()).save(file)
+            save_png(frame, file)
         print(photo.stem, flush=True)
 
 
@@ -137,14 +190,24 @@ def end_frames(pipeline: Pipeline, photo: Path) -> list[Tensor]:
 
 
 def photo_names(folder: Path) -> list[str]:
-    """The names of all photos whose end frames lie in a folder."""
+    """The sorted names of all photos whose end frames lie in a folder.
+
+    InputError if the folder cannot be read, or there are none.
+    """
     ending = f"_{END_NAMES[0]}.png"
-    return sorted(file.name.removesuffix(ending) for file in folder.glob(f"*{ending}"))
+    names = [file.name.removesuffix(ending) for file in list_files(folder, (ending,))]
+    if not names:
+        raise InputError(f"{folder}: has no NAME{ending}: give a folder that `ends` has written")
+    return sorted(names)
 
 
 def both_ends(folder: Path, name: str) -> Image.Image:
-    """The left and the right end frame of a photo side by side, at their own size."""
-    frames = [Image.open(folder / f"{name}_{end}.png").convert("RGB") for end in END_NAMES]
+    """The left and the right end frame of a photo side by side, at their own size.
+
+    InputError if one of them is missing or damaged.
+    """
+    files = [folder / f"{name}_{end}.png" for end in END_NAMES]
+    frames = [read_image(file, lambda image: image.convert("RGB")) for file in files]
     return joined(frames, across=True)
 
 
@@ -162,16 +225,40 @@ def joined(pictures: Sequence[Image.Image], *, across: bool) -> Image.Image:
     return Image.fromarray(np.concatenate(padded, axis))
 
 
+def save_sheet(picture: Image.Image, file: Path) -> None:
+    """Write a picture as a PNG, whole or not at all; InputError if it cannot be written."""
+    save_png(torch.from_numpy(np.array(picture)), file)
+
+
+def make_readers_folder(output: Path, key: Path) -> None:
+    """Create the readers' folder, and check that the key can be written outside of it.
+
+    Raises:
+        InputError: the folder cannot be created, or the key cannot be written or is within it.
+    """
+    make_folder(output)
+    if output.resolve() in key.resolve().parents:
+        raise InputError(
+            f"{key}: the key would be in the readers' folder {output}, where they would see it: "
+            "name a file elsewhere"
+        )
+    check_writable(key)
+
+
 def write_sheets(ends: Path, output: Path, key: Path, seed: int) -> None:
-    """Write a numbered picture for each photo in random order, the readers' text, and the key."""
+    """Write a numbered picture for each photo in random order, the readers' text, and the key.
+
+    Raises:
+        InputError: there are no ends, one cannot be read, or the results cannot be written.
+    """
     names = photo_names(ends)
     random.Random(seed).shuffle(names)
-    output.mkdir(parents=True, exist_ok=True)
+    make_readers_folder(output, key)
     numbers = {f"{number:02d}": name for number, name in enumerate(names, start=1)}
     for number, name in numbers.items():
-        both_ends(ends, name).save(output / f"{number}.png")
-    (output / "README.txt").write_text(RATING_TEXT + SHEET_TEXT)
-    key.write_text(json.dumps({number: {"photo": name} for number, name in numbers.items()}))
+        save_sheet(both_ends(ends, name), output / f"{number}.png")
+    write_atomic(output / "README.txt", (RATING_TEXT + SHEET_TEXT).encode())
+    write_json({number: {"photo": name} for number, name in numbers.items()}, key)
 
 
 def write_pairs(
@@ -181,66 +268,216 @@ def write_pairs(
 
     A photo whose four frames are the same in both versions is left out. Each version is in the
     upper row for a random half of the other photos; with `swapped`, rows are exchanged in all.
+
+    Raises:
+        InputError: the versions have no photo in common, or none that they show differently; one
+            of the frames cannot be read, or the results cannot be written.
     """
     chance = random.Random(seed)
-    names = [name for name in photo_names(old) if name in set(photo_names(new))]
+    new_names = set(photo_names(new))
+    names = [name for name in photo_names(old) if name in new_names]
+    if not names:
+        raise InputError(f"{new}: has none of the photos of {old}: give ends of the same photos")
+    make_readers_folder(output, key)
     chance.shuffle(names)
     rows_by_name: dict[str, dict[str, Image.Image]] = {}
     for name in names:
         rows = {"old": both_ends(old, name), "new": both_ends(new, name)}
         if not np.array_equal(np.asarray(rows["old"]), np.asarray(rows["new"])):
             rows_by_name[name] = rows
+    if not rows_by_name:
+        raise InputError(f"{new}: shows each photo as {old} does: give ends of another version")
     is_new_above = [index % 2 == 0 for index in range(len(rows_by_name))]
     chance.shuffle(is_new_above)
 
-    output.mkdir(parents=True, exist_ok=True)
     entries: dict[str, dict[str, str]] = {}
     for (name, rows), new_above in zip(rows_by_name.items(), is_new_above, strict=True):
         order = ("new", "old") if new_above != swapped else ("old", "new")
         number = f"{len(entries) + 1:02d}"
-        joined([rows[version] for version in order], across=False).save(output / f"{number}.png")
+        sheet = joined([rows[version] for version in order], across=False)
+        save_sheet(sheet, output / f"{number}.png")
         entries[number] = {"photo": name, **dict(zip(SIDES, order, strict=True))}
-    (output / "README.txt").write_text(RATING_TEXT + PAIR_TEXT)
-    key.write_text(json.dumps(entries, indent=1))
+    write_atomic(output / "README.txt", (RATING_TEXT + PAIR_TEXT).encode())
+    write_json(entries, key)
 
 
 # Ratings ------------------------------------------------------------------------------------------
 
 
-def collect(readings: Sequence[dict[str, Any]], keys: Sequence[dict[str, dict[str, str]]]) -> str:
+class Rating(BaseModel):
+    """What a reader wrote of one video; further keys are ignored."""
+
+    rating: Annotated[int, Field(ge=1, le=5)]
+    border: bool  # a flaw at first sight at the picture's border
+    inside: bool  # a flaw at first sight elsewhere
+    flaw: str = ""  # the worst one
+
+
+class PairRating(BaseModel):
+    """What a reader wrote of a picture with two videos; further keys are ignored."""
+
+    A: Rating
+    B: Rating
+    better: Literal["A", "B", "same"]
+
+
+class SheetEntry(BaseModel):
+    """What the key of `sheets` says of a picture."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    photo: str
+
+
+class PairEntry(SheetEntry):
+    """What the key of `pairs` says of a picture: which version is in which row."""
+
+    A: Version
+    B: Version
+
+    def version(self, side: str) -> Version:
+        """The version in the row "A" or "B"."""
+        return self.A if side == "A" else self.B
+
+
+def read_entries(file: Path, kind: str) -> dict[str, Any]:
+    """A file's JSON object with an entry for each picture, which is not checked yet.
+
+    InputError, which names the file's kind, if it is no JSON object, or an empty one.
+    """
+    text = read_text(file, kind)
+    # Python's reader of JSON reports too many brackets within each other by a RecursionError.
+    with as_input_error(file, "not JSON ({reason}): mend it", ValueError, RecursionError):
+        content = json.loads(text)
+    if not isinstance(content, dict) or not content:
+        raise InputError(f'{file}: must be {{"01": ..., ...}}, with an entry for each picture')
+    return content
+
+
+def checked_entries(file: Path, content: Mapping[str, Any], model: type[Entry]) -> dict[str, Entry]:
+    """The entries of a file as objects of `model`; InputError for the first that is none."""
+    return {
+        number: validated(model, entry, f"{file}: picture {number}")
+        for number, entry in content.items()
+    }
+
+
+def read_key(file: Path) -> dict[str, SheetEntry] | dict[str, PairEntry]:
+    """What `sheets` or `pairs` has written of each picture, by its number.
+
+    InputError if the file cannot be read or says something else.
+    """
+    content = read_entries(file, "key")
+    if not any("A" in entry for entry in content.values() if isinstance(entry, dict)):
+        return checked_entries(file, content, SheetEntry)
+    entries = checked_entries(file, content, PairEntry)
+    for number, entry in entries.items():
+        if entry.A == entry.B:
+            raise InputError(
+                f"{file}: picture {number}: A and B are both {entry.A}: give a key of `pairs`"
+            )
+    return entries
+
+
+def read_ratings(
+    file: Path, key_file: Path, key: Mapping[str, SheetEntry]
+) -> dict[str, Rating] | dict[str, PairRating]:
+    """What a reader wrote of each picture of a key, by its number.
+
+    Args:
+        file: the reader's file.
+        key_file: the key's file, for messages.
+        key: what the key says of each picture.
+
+    Raises:
+        InputError: the file cannot be read, has ratings of other pictures than the key, or an
+            entry that is not as the readers' text demands.
+    """
+    content = read_entries(file, "reader's file")
+    for number in key:
+        if number not in content:
+            raise InputError(
+                f"{file}: has no rating of picture {number}, which is in the key {key_file}: "
+                "rate it, or give the key of this reader's pictures"
+            )
+    for number in content:
+        if number not in key:
+            raise InputError(
+                f"{file}: rates picture {number}, which is not in the key {key_file}: "
+                "give the key of this reader's pictures"
+            )
+    if is_of_pairs(key):
+        return checked_entries(file, content, PairRating)
+    return checked_entries(file, content, Rating)
+
+
+def is_of_pairs(key: Mapping[str, SheetEntry]) -> bool:
+    """Whether a key was written by `pairs`."""
+    return all(isinstance(entry, PairEntry) for entry in key.values())
+
+
+def table_of_files(files: Sequence[Path], key_files: Sequence[Path]) -> str:
+    """The table of `collect` for the files of readers and of keys.
+
+    Raises:
+        InputError: a file cannot be read or used, there are several keys but not one for each
+            reader, or keys of sheets and of pairs.
+    """
+    if len(key_files) not in (1, len(files)):
+        raise InputError(
+            f"--key: {len(key_files)} keys for {len(files)} readers: give one for all, or one for "
+            "each"
+        )
+    keys = [read_key(file) for file in key_files]
+    for key_file, key in zip(key_files, keys, strict=True):
+        if is_of_pairs(key) != is_of_pairs(keys[0]):
+            raise InputError(
+                f"{key_file}: of the keys, some are of `sheets` and some of `pairs`, as this and "
+                f"{key_files[0]}: give those of one kind"
+            )
+
+    # One key is that of all readers.
+    repetitions = len(files) // len(keys)
+    key_files = [*key_files] * repetitions
+    keys = keys * repetitions
+    readings = [
+        read_ratings(file, key_file, key)
+        for file, key_file, key in zip(files, key_files, keys, strict=True)
+    ]
+    return collect(readings, keys)
+
+
+def collect(
+    readings: Sequence[Mapping[str, Rating | PairRating]],
+    keys: Sequence[Mapping[str, SheetEntry]],
+) -> str:
     """A table of what readers wrote: a row for each version, or one for sheets of one version.
 
     For pairs, the last line says how often each version was preferred, and how often the upper and
     the lower row of a picture, which is equally often if readers look at what is shown alone.
 
     Args:
-        readings: each reader's file.
-        keys: what `sheets` or `pairs` has written for each reader, or one key for all.
-
-    Raises:
-        InputError: there are several keys, but not one for each reader.
+        readings: what each reader wrote of each picture, by its number.
+        keys: each reader's key, with the same numbers; all of sheets, or all of pairs.
     """
-    if len(keys) not in (1, len(readings)):
-        raise InputError(
-            f"{len(keys)} keys for {len(readings)} readers: give one for all, or one for each"
-        )
-    keys = keys if len(keys) == len(readings) else [keys[0]] * len(readings)
-    answers: dict[str, list[dict[str, Any]]] = {}  # by version
+    answers: dict[str, list[Rating]] = {}  # by version
     preferences = {"old": 0, "new": 0, "same": 0}
     rows_preferred = {"A": 0, "B": 0}
-    is_pairs = all("A" in entry for key in keys for entry in key.values())
+    is_pairs = all(is_of_pairs(key) for key in keys)
     for reading, key in zip(readings, keys, strict=True):
         for number, entry in key.items():
             answer = reading[number]
-            if not is_pairs:
+            if isinstance(answer, Rating):
                 answers.setdefault("all", []).append(answer)
                 continue
-            for side in SIDES:
-                answers.setdefault(entry[side], []).append(answer[side])
-            better = answer["better"]
-            preferences[entry.get(better, "same")] += 1
-            if better in rows_preferred:
-                rows_preferred[better] += 1
+            assert isinstance(entry, PairEntry)
+            for side, rating in zip(SIDES, (answer.A, answer.B), strict=True):
+                answers.setdefault(entry.version(side), []).append(rating)
+            if answer.better == "same":
+                preferences["same"] += 1
+            else:
+                preferences[entry.version(answer.better)] += 1
+                rows_preferred[answer.better] += 1
 
     rows = [
         [version, *summary(answers[version], len(readings))]
@@ -257,12 +494,12 @@ def collect(readings: Sequence[dict[str, Any]], keys: Sequence[dict[str, dict[st
     return f"{table}\n\npreferred: {counts} (sign test: p = {chance:.3f}); {by_row}"
 
 
-def summary(answers: Sequence[dict[str, Any]], readers: int) -> list[str]:
+def summary(answers: Sequence[Rating], readers: int) -> list[str]:
     """Mean rating, share of 4 and 5, number of 1, and flaws by place; numbers a reader."""
-    ratings = [answer["rating"] for answer in answers]
+    ratings = [answer.rating for answer in answers]
     posted = sum(rating >= POSTED for rating in ratings) / len(ratings)
     broken = sum(rating == 1 for rating in ratings) / readers
-    flaws = [sum(bool(answer[place]) for answer in answers) / readers for place in PLACES]
+    flaws = [sum(getattr(answer, place) for answer in answers) / readers for place in PLACES]
     return [
         f"{sum(ratings) / len(ratings):.2f}",
         f"{posted:.0%}",
@@ -311,13 +548,14 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one of the commands."""
-    chosen = parser().parse_args(arguments)
+def run(chosen: argparse.Namespace) -> None:
+    """Run the command that the options name; InputError if its input or output cannot be used."""
     if chosen.command == "draw":
         photos = draw(chosen.folders, chosen.count, chosen.seed)
-        chosen.output.write_text("".join(f"{photo}\n" for photo in photos))
+        write_atomic(chosen.output, "".join(f"{photo}\n" for photo in photos).encode())
     elif chosen.command == "ends":
+        if chosen.frames % FRAMES:
+            raise InputError(f"--frames {chosen.frames}: must be a multiple of {FRAMES}")
         options = PipelineOptions(
             base=BaseSettings(name="lite"),
             path=PathOptions(
@@ -325,8 +563,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ),
             fill=FillOptions(fill=chosen.fill),
         )
-        photos = [Path(line) for line in chosen.photos.read_text().splitlines()]
-        save_ends(photos, options, chosen.output)
+        save_ends(read_photo_list(chosen.photos), options, chosen.output)
     elif chosen.command == "sheets":
         write_sheets(chosen.ends, chosen.output, chosen.key, chosen.seed)
     elif chosen.command == "pairs":
@@ -339,9 +576,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             swapped=chosen.swapped,
         )
     else:
-        readings = [json.loads(file.read_text()) for file in chosen.readings]
-        print(collect(readings, [json.loads(file.read_text()) for file in chosen.key]))
+        print(table_of_files(chosen.readings, chosen.key))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one of the commands; returns the exit code: 0, or 2 after a line about bad input."""
+    chosen = parser().parse_args(arguments)
+    try:
+        run(chosen)
+    except InputError as error:
+        print(f"error: {printable_line(str(error))}", file=sys.stderr)
+        return BAD_INPUT
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
