@@ -17,6 +17,7 @@ import argparse
 import collections
 import dataclasses
 import math
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,7 @@ import torch
 from torch import Tensor
 
 from spackle.bases.depth import lift_rgbd
+from spackle.cli.script_command import run_script
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.flow import inside, pixel_grid, sample
 from spackle.core.camera import Camera
@@ -37,6 +39,7 @@ from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import shipped_network
+from spackle.runtime.errors import InputError
 from spackle.scene_fill import FillContext, fill_scene
 
 BOARD_M, FOCUS_M = 1.5, 3.0
@@ -243,6 +246,9 @@ def main() -> None:
     )
     parser.add_argument("--frames", type=int, default=24)
     options = parser.parse_args()
+    for name in ("side", "frames"):
+        if getattr(options, name) < 1:
+            raise InputError(f"--{name} {getattr(options, name)}: must be at least 1")
     world = load_world(options.side)
     # PSNR in the holes
     heads = (
@@ -278,4 +284,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

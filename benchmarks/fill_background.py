@@ -11,14 +11,18 @@ here, so this is no independent test of them.
 
 from __future__ import annotations
 
+import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
 import spackle
+from spackle.cli.script_command import run_script
 from spackle.render import CpuRenderer
 from spackle.residual.features import hole_mask
+from spackle.runtime.errors import InputError
 from spackle.scene_fill.fill_plan import plan_fill
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
@@ -34,21 +38,19 @@ from helpers.open_scenes import (
 
 RENDERER = CpuRenderer()
 
-
-def scenes() -> dict[str, OpenScene]:
-    """Other scenes than those of the numbers' choice, by what the table calls them."""
-    return {
-        "cup, 7 views": cup(count=7, height=0.4),
-        "chair, 16 views from low": chair(count=16, height=0.5, hole=0.16),
-        "chair with crossbars, 6 views": chair(count=6, height=1.3, crossbars=True),
-        "table, 8 views from above": table(count=8, height=2.0, hole=0.35),
-        "table, 5 views from low": table(count=5, height=0.9),
-        "street, 3 photos and 7 new views": street(seed=3, count=10, novel=0.8),
-        "street, new views only": street(seed=5, both=False, novel=0.5, high=1.4),
-        "house, 16 views": houses_around(count=16, hole=1.1),
-        "house, 6 views": houses_around(count=6, hole=0.5),
-        "room, 12 views": room(count=12, hole=0.5),
-    }
+# Other scenes than those of the numbers' choice, by what the table calls them.
+SCENES: dict[str, Callable[[], OpenScene]] = {
+    "cup, 7 views": lambda: cup(count=7, height=0.4),
+    "chair, 16 views from low": lambda: chair(count=16, height=0.5, hole=0.16),
+    "chair with crossbars, 6 views": lambda: chair(count=6, height=1.3, crossbars=True),
+    "table, 8 views from above": lambda: table(count=8, height=2.0, hole=0.35),
+    "table, 5 views from low": lambda: table(count=5, height=0.9),
+    "street, 3 photos and 7 new views": lambda: street(seed=3, count=10, novel=0.8),
+    "street, new views only": lambda: street(seed=5, both=False, novel=0.5, high=1.4),
+    "house, 16 views": lambda: houses_around(count=16, hole=1.1),
+    "house, 6 views": lambda: houses_around(count=6, hole=0.5),
+    "room, 12 views": lambda: room(count=12, hole=0.5),
+}
 
 
 @torch.no_grad()
@@ -91,17 +93,24 @@ def row(name: str, scene: OpenScene) -> str:
 
 def main() -> None:
     """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("words", nargs="*", help="only scenes with one of these in their names")
+    words = parser.parse_args().words
+    for word in words:
+        if not any(word in name for name in SCENES):
+            raise InputError(f"{word}: in no scene's name: there are {', '.join(SCENES)}")
+
     print(
         "| scene | recall | precision | holes closed | background left empty | "
         "what was seen, worst view | added / by a second fill |"
     )
     print("|---|---|---|---|---|---|---|")
-    wanted = sys.argv[1:]
-    for name, scene in scenes().items():
-        if wanted and not any(word in name for word in wanted):
-            continue
-        print(row(name, scene), flush=True)
+    for name, make in SCENES.items():
+        if not words or any(word in name for word in words):
+            print(row(name, make()), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

@@ -37,6 +37,7 @@ import torch
 
 import spackle
 from spackle.bases.settings import BaseSettings
+from spackle.cli.script_command import run_script
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import load_photo
@@ -45,6 +46,8 @@ from spackle.formats.ply_tables import PlyTables
 from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import encoder_for, load_scene
 from spackle.pipeline import CompletedPhoto, Pipeline, PipelineOptions
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import check_writable
 from spackle.runtime.progress import Reporter
 
 HARMONICS_OF_DEGREE_3 = 15  # 4² - 1; those of degree 0 are the colour itself
@@ -245,6 +248,10 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=9, help="views along the path")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
+    if options.views < 1:
+        raise InputError(f"--views {options.views}: must be at least 1")
+    if options.output is not None:
+        check_writable(options.output)
 
     print("| scene | file | Gaussians | holes | filled | by predict | file's rows ", end="")
     print("| photo's view | colour | s |")
@@ -258,4 +265,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

@@ -30,6 +30,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
+from spackle.cli.script_command import run_script
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
@@ -53,7 +54,7 @@ from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import shipped_network
 from spackle.runtime.device import Precision, hardware_facts, package_versions
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import write_atomic
+from spackle.runtime.files import check_file, check_writable, write_atomic
 from spackle.runtime.parallel_kernels import device_for_kernels
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.unet import UNet
@@ -470,7 +471,7 @@ STEPS = (
 )
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the steps; returns 0 unless one failed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -479,7 +480,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("-c", "--checkpoint", type=Path)
     parser.add_argument("--only", default=",".join(step.__name__ for step in STEPS))
     parser.add_argument("--step", help=argparse.SUPPRESS)
-    options = parser.parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    options = parser.parse_args(words)
     steps = {step.__name__: step for step in STEPS}
     if options.step:
         try:
@@ -492,6 +494,9 @@ def main(arguments: Sequence[str]) -> int:
     chosen = options.only.split(",")
     if unknown := set(chosen) - set(steps):
         parser.error(f"--only {', '.join(sorted(unknown))}: the steps are {', '.join(steps)}")
+    if options.checkpoint is not None:
+        check_file(options.checkpoint, "file of SHARP's weights")
+    check_writable(options.output)
     facts = {
         **hardware_facts(CUDA if torch.cuda.is_available() else torch.device("cpu")),
         **package_versions(),
@@ -503,7 +508,7 @@ def main(arguments: Sequence[str]) -> int:
     ]
     failed = 0
     for name in chosen:
-        start, command = time.perf_counter(), [sys.executable, __file__, *arguments, "--step", name]
+        start, command = time.perf_counter(), [sys.executable, __file__, *words, "--step", name]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S)
             code, said, log = done.returncode, done.stdout.strip(), done.stderr
@@ -526,4 +531,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_script(main))

@@ -30,8 +30,11 @@ import torch
 from PIL import Image
 
 import spackle
+from spackle.cli.script_command import run_script
 from spackle.paper.evaluation.plots import MATPLOTLIB_SETTINGS
 from spackle.results.results_file import RESULTS_NAME
+from spackle.runtime.errors import InputError
+from spackle.runtime.folders import make_folder
 
 PHOTO_SIZE = (64, 48)  # width and height in pixels
 GAUSSIAN_COUNT = 48
@@ -213,6 +216,9 @@ def main() -> None:
     parser.add_argument("--ray-photos", type=int, default=300, help="for Ray; 0 for none")
     parser.add_argument("-o", "--output", type=Path, default=Path("many-photos"))
     options = parser.parse_args()
+    if options.photos < 1:
+        raise InputError(f"--photos {options.photos}: must be at least 1")
+    make_folder(options.output)
 
     engines: dict[str, tuple[int, list[str]]] = {
         "one process": (options.photos, []),
@@ -223,7 +229,6 @@ def main() -> None:
             words = ["--ray", "local", "--workers", str(count)]
             engines[f"Ray, {count} worker{'s' * (count > 1)}"] = (options.ray_photos, words)
 
-    options.output.mkdir(parents=True, exist_ok=True)
     print("| | photos | ms a photo | ms of the command | MB at 100 | MB at the end |")
     print("|---|---|---|---|---|---|")
     runs: dict[str, list[Sample]] = {}
@@ -241,4 +246,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

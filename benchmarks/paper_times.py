@@ -20,7 +20,7 @@ import functools
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ from suite_scenes import commit, find_view, holed_scene
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
+from spackle.cli.script_command import run_script
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
@@ -49,7 +50,7 @@ from spackle.render import Renderer, get_renderer
 from spackle.residual import MIN_AUX_GAUSSIANS, ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual, open_residual, shipped_network
 from spackle.residual.network import predict_deltas
-from spackle.runtime.device import hardware_facts, package_versions, pick_dtype
+from spackle.runtime.device import hardware_facts, package_versions, pick_device, pick_dtype
 from spackle.runtime.files import write_atomic, write_json
 from spackle.runtime.folders import make_folder
 from spackle.scene_fill import FillContext
@@ -68,7 +69,7 @@ class View(NamedTuple):
     camera: Camera
 
 
-def parse(arguments: list[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -133,12 +134,15 @@ def with_cpu_clock(
     print(f"{name}: {time.perf_counter() - start:.1f} s", flush=True)
 
 
-def main(arguments: list[str]) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Time everything, and write the results after each turn of all tasks."""
     options = parse(arguments)
-    device = torch.device(options.device)
+    device = pick_device(options.device)
     make_folder(options.output)
     load_before = os.getloadavg()[0]
+
+    # The networks come first, because their files may be missing.
+    networks = open_networks(options.residual, device)
 
     # The base, and a photo of the shape of the scene's.
     sharp = SharpBase.load(options.checkpoint, precision=options.precision, device=device)
@@ -153,7 +157,6 @@ def main(arguments: list[str]) -> None:
     views = find_views(scene, photo_camera, renderer)
     print(f"views: {[(round(v.hole_ratio, 4), round(v.disparity, 3)) for v in views]}", flush=True)
 
-    networks = open_networks(options.residual, device)
     contexts = {
         name: FillContext(scene, photo_camera, renderer, network, precision=options.precision)
         for name, network in networks.items()
@@ -320,4 +323,4 @@ def table(cases: Mapping[str, tuple[str, View]], facts: Mapping[str, Any]) -> st
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(run_script(main))

@@ -32,6 +32,7 @@ import dataclasses
 import json
 import math
 import re
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,6 +43,7 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.bases.settings import BaseSettings
+from spackle.cli.script_command import run_script
 from spackle.core.camera import Camera
 from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
@@ -53,8 +55,11 @@ from spackle.posed.capture import Capture, PosedFile, read_capture
 from spackle.posed.path import central_first
 from spackle.posed.scene import PosedScene, complete_posed
 from spackle.residual import hole_mask
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import check_writable
 from spackle.runtime.progress import Reporter
 
+CHOICE = re.compile(r"spread|near|random-\d+")  # of photos that make a scene
 SCENES = ("nearest", "union", "filled")
 COLUMNS = ("PSNR", "in holes", "elsewhere", "distance", "holes")
 LEAST_HOLE_PIXELS = 200  # fewer give no PSNR worth the name
@@ -82,10 +87,7 @@ def choose(capture: Capture, choice: str, count: int) -> list[int]:
         while len(chosen) < count:
             chosen.append(int(distances[chosen].min(0).values.argmax()))
         return chosen
-    seed = re.fullmatch(r"random-(\d+)", choice)
-    if seed is None:
-        raise SystemExit(f"{choice}: choose spread, near or random-N")
-    generator = torch.Generator().manual_seed(int(seed[1]))
+    generator = torch.Generator().manual_seed(int(choice.removeprefix("random-")))
     return torch.randperm(len(capture.photos), generator=generator)[:count].tolist()
 
 
@@ -171,11 +173,22 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
 
-    capture = read_capture(options.folder)
-    pipeline = Pipeline.open(PipelineOptions(base=BaseSettings(name=options.base)))
+    for choice in options.choices:
+        if CHOICE.fullmatch(choice) is None:
+            raise InputError(f"--choices {choice}: choose spread, near or random-N")
+    for file in (options.output, options.json):
+        if file is not None:
+            check_writable(file)
     features = None
     if options.features is not None:
         features = load_features("squeezenet", options.features, torch.device("cpu"))
+    capture = read_capture(options.folder)
+    if not 0 < options.photos < len(capture.photos):
+        raise InputError(
+            f"--photos {options.photos}: {options.folder} has {len(capture.photos)} photos: "
+            "give at least 1, and fewer than all"
+        )
+    pipeline = Pipeline.open(PipelineOptions(base=BaseSettings(name=options.base)))
     print(f"| photos | scene | {' | '.join(COLUMNS)} |")
     print("|---|---|" + "---|" * len(COLUMNS))
     numbers: dict[str, object] = {}
@@ -216,4 +229,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

@@ -11,6 +11,7 @@ deviations), and a fifth of the photos that could see a point do not.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from rendered_scenes import SCENES, focal_of, render
+
+from spackle.cli.script_command import run_script
+from spackle.runtime.errors import InputError
+from spackle.runtime.folders import make_folder
 
 Array = NDArray[Any]
 
@@ -65,6 +70,13 @@ def main() -> None:
     parser.add_argument("scene", choices=SCENES)
     parser.add_argument("folder", type=Path)
     options = parser.parse_args()
+    model = options.folder / "sparse" / "0"
+    photos = options.folder / "images"
+    for part in (model, photos):
+        if part.exists():
+            raise InputError(f"{part}: is there already: give another folder")
+    make_folder(options.folder)
+
     scene = SCENES[options.scene]()
     focal = focal_of(scene, WIDTH)
     rng = np.random.default_rng(0)
@@ -77,10 +89,8 @@ def main() -> None:
         ]
     )
 
-    model = options.folder / "sparse" / "0"
-    photos = options.folder / "images"
-    model.mkdir(parents=True)
-    photos.mkdir()
+    make_folder(model)
+    make_folder(photos)
     lines = []
     for number, ((rgb, depth), eye) in enumerate(zip(views, eyes, strict=True)):
         Image.fromarray(rgb).save(photos / f"{number:03d}.png")
@@ -105,4 +115,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

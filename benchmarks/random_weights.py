@@ -10,6 +10,7 @@ Scenes that these weights make are meaningless.
 from __future__ import annotations
 
 import argparse
+import sys
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +22,9 @@ from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes as sharp_shapes
 from spackle.bases.sharp.encoder import SIZES
+from spackle.cli.script_command import run_script
 from spackle.inpaint.lama_network import expected_shapes as lama_shapes
+from spackle.runtime.files import check_writable
 
 
 def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
@@ -65,10 +68,11 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="a name that ends in .pt or .safetensors")
     parser.add_argument("--size", choices=("full", "tiny", "micro", "lama"), default="full")
     words = parser.parse_args()
+    check_writable(words.file)
     lama = words.size == "lama"
     tensors = lama_weights() if lama else deterministic_weights(sharp_shapes(SIZES[words.size]))
     (torch.save if words.file.suffix == ".pt" else save_file)(tensors, words.file)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

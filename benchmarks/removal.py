@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from torch import Tensor
 import spackle
 from spackle import Camera, Gaussians
 from spackle.bases.depth import lift_rgbd
+from spackle.cli.script_command import run_script
 from spackle.core.filters import maximum_filter
 from spackle.depth.depth_map import DepthMap
 from spackle.inpaint import InpainterOptions, get_inpainter, known_inverse_depth
@@ -39,6 +41,8 @@ from spackle.paper.training.feature_networks import FeatureNet, load_features
 from spackle.paper.training.losses import hole_distance, hole_psnr
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
+from spackle.runtime.errors import InputError, unknown_name
+from spackle.runtime.files import check_writable
 
 WIDTH, HEIGHT = 320, 240
 ROUGH_PX = 3  # how far the mask reaches over the outline
@@ -172,6 +176,12 @@ def main() -> None:
     parser.add_argument("--figure-scene", default="still_life", help="its scene")
     parser.add_argument("--only", nargs="*", default=list(rendered_scenes.SCENES))
     words = parser.parse_args()
+    for scene in (*words.only, words.figure_scene):
+        if scene not in rendered_scenes.SCENES:
+            raise InputError(f"scene {scene} is {unknown_name(scene, [*rendered_scenes.SCENES])}")
+    for file in (words.output, words.figure):
+        if file is not None:
+            check_writable(file)
     features = None
     if words.features is not None:
         features = load_features("squeezenet", words.features)
@@ -205,4 +215,4 @@ def row_of(scene: str, method: str, figures: list[float]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

@@ -25,6 +25,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from skimage import data as pictures
 
+from spackle.cli.script_command import run_script
+from spackle.runtime.folders import make_folder
+
 # The ray tracer belongs to the training of the base `lite`, which is beside the package.
 sys.path.append(str(Path(__file__).parents[1] / "research" / "lite"))
 from ray_tracer import BOX, CYLINDER, ELLIPSOID, SHEET, Solid, trace
@@ -783,7 +786,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder")
     parser.add_argument("--width", type=int, default=640, help="of the pictures, in pixels")
     words = parser.parse_args()
-    words.output.mkdir(parents=True, exist_ok=True)
+    make_folder(words.output)
     for name, make in SCENES.items():
         scene = make()
         rgb, depth = render(scene, words.width, words.width * 3 // 4)
@@ -793,4 +796,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

@@ -36,6 +36,11 @@ from reproduced_claims import claims_of_folder
 from sharp_stand_in import write_stand_in
 from skimage import data as pictures
 
+from spackle.cli.script_command import run_script
+from spackle.paper.training.feature_networks import load_features
+from spackle.runtime.errors import InputError
+from spackle.runtime.folders import make_folder
+
 WIDTH = 480  # of rendered photos, in pixels
 SIDE = 320  # long side of the views in tables, in pixels; figures show the photos' full size
 MAX_PHOTO_SIDE = 480  # long side of scikit-image's photos, in pixels
@@ -299,7 +304,10 @@ def main() -> None:
     features = None if arguments.features is None else arguments.features.absolute()
     began = time.monotonic()
     if out.exists():
-        parser.error(f"{out}: is there already: give another folder with -o")
+        raise InputError(f"{out}: is there already: give another folder with -o")
+    if features is not None:
+        load_features("squeezenet", features)  # an error now is better than one after minutes
+    make_folder(out)
 
     make_data(out / "data", out / "training_photos")
     photos = [
@@ -325,4 +333,4 @@ def cpu_seconds() -> float:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

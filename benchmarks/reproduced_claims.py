@@ -10,13 +10,16 @@ Numbers come out as the run has them, whether a claim holds or not.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from spackle.cli.script_command import run_script
 from spackle.paper.evaluation.folder import load_run
 from spackle.paper.evaluation.measurements import Run, mean_of_known
 from spackle.paper.evaluation.pictures import picture_title
+from spackle.runtime.errors import InputError
 
 EXPECTED_RATIO = (0.95, 1.05)  # of added Gaussians over masked cells
 FILE = "claims.md"
@@ -86,12 +89,29 @@ def claims_of_folder(folder: Path) -> str:
     """The claims by the evaluations in the folder of `benchmarks/reproduce.py`.
 
     The bases that need no weights come first, then the stand-in of SHARP.
+
+    Raises:
+        InputError: an evaluation cannot be read, or there are none of large or of near views.
     """
     large = [load_run(path) for path in sorted((folder / "runs").glob("*-large"))]
     near = [load_run(path) for path in sorted((folder / "runs").glob("*-near"))]
+    if not large or not near:
+        raise InputError(
+            f"{folder}: has no evaluations runs/*-large or runs/*-near: give a folder that "
+            "benchmarks/reproduce.py has made"
+        )
     large.sort(key=lambda run: "direct-ft" in run.methods)
     return claims(large, [run for run in near if "direct-ft" in run.methods])
 
 
+def main() -> None:
+    """Print the claims."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path, help="which benchmarks/reproduce.py has made")
+    print(claims_of_folder(parser.parse_args().folder), end="")
+
+
 if __name__ == "__main__":
-    print(claims_of_folder(Path(sys.argv[1])), end="")
+    sys.exit(run_script(main))

@@ -25,6 +25,10 @@ import numpy as np
 from PIL import Image
 from skimage.data import stereo_motorcycle
 
+from spackle.cli.script_command import run_script
+from spackle.runtime.errors import as_input_error
+from spackle.runtime.files import check_writable
+
 WIDTH, HEIGHT, FOCAL = 640, 432, 860.0
 VARYING = ("seconds", "request")
 
@@ -88,6 +92,15 @@ def digest(file: Path) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def read_hashes(file: Path) -> dict[str, str]:
+    """The hashes by name that `-o` has written; InputError if the file cannot be used."""
+    with as_input_error(file, "no hashes ({reason}): give a file that -o has written"):
+        hashes = json.loads(file.read_text())
+        if not isinstance(hashes, dict):
+            raise TypeError("not an object")
+    return hashes
+
+
 def main() -> int:
     """Run the commands, print each file's hash, and return 1 if one differs."""
     parser = argparse.ArgumentParser(
@@ -96,6 +109,11 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, help="write the hashes here, as JSON")
     parser.add_argument("--against", type=Path, help="compare with these hashes")
     options = parser.parse_args()
+    # Before the commands, which take minutes.
+    before = None if options.against is None else read_hashes(options.against)
+    if options.output is not None:
+        check_writable(options.output)
+
     hashes: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -107,7 +125,8 @@ def main() -> int:
             for file in sorted(output.rglob("*")):
                 if file.name == "report.json" or file.suffix in (".ply", ".png"):
                     hashes[str(file.relative_to(folder))] = digest(file)
-    before = json.loads(options.against.read_text()) if options.against else hashes
+    if before is None:
+        before = hashes
     differing = [
         name for name in sorted({*before, *hashes}) if before.get(name) != hashes.get(name)
     ]
@@ -121,4 +140,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(main))

@@ -64,6 +64,7 @@ import spackle
 from spackle import Camera, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.depth import lift_rgbd
 from spackle.bases.lite import MAX_DEPTH_RATIO
+from spackle.cli.script_command import run_script
 from spackle.core.filters import maximum_filter
 from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.photo import load_photo, resize_photo
@@ -76,6 +77,8 @@ from spackle.paper.evaluation.metrics import GREY_WEIGHTS, sharpness
 from spackle.paper.training.feature_networks import FeatureNet, load_features
 from spackle.paper.training.losses import covered_fraction, hole_psnr
 from spackle.paper.training.measured_photos import StereoPair, load_pair
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import check_writable, list_files
 
 Row = dict[str, float]  # the figures of a scene, by name
 Rows = dict[str, Row]  # the rows of scenes, by name
@@ -93,6 +96,7 @@ STEPS = 255  # of inverse depth in a phone's map
 DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR"), 3)  # other figures have 2
 SECONDS = ("s lift", "s fill")
 PHOTOS, PHOTO_HEIGHT = 8, 256  # of photos on a sheet
+PHOTO_ENDINGS = (".jpg", ".jpeg", ".png")
 CUT_PHOTOS = 24  # photos of a folder that are used with cut sides
 DEFAULT = "default"
 RENDERER = get_renderer()
@@ -403,17 +407,42 @@ def ledger(runs: dict[str, Rows]) -> str:
 
 
 def pictures_in(folder: Path, most: int) -> list[Path]:
-    """At most `most` photos of a folder, evenly spaced in the order of names."""
-    files = [
-        path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in (".jpg", ".jpeg", ".png")
-    ]
-    return (
-        [files[i] for i in sorted({round(i) for i in np.linspace(0, len(files) - 1, most)})]
-        if files
-        else []
-    )
+    """At most `most` photos of a folder, evenly spaced in the order of names.
+
+    Raises:
+        InputError: the folder cannot be read, or has no photo.
+    """
+    files = list_files(folder, PHOTO_ENDINGS)
+    if not files:
+        raise InputError(
+            f"{folder}: has no photo ({', '.join(PHOTO_ENDINGS)}): give a folder of photos, or as "
+            "PAIRS one of folders with a scene.json"
+        )
+    indices = sorted({round(i) for i in np.linspace(0, len(files) - 1, most)})
+    return [files[index] for index in indices]
+
+
+def read_figures(file: Path, small: int) -> dict[str, Rows]:
+    """The figures of another run by mechanism and scene, as `-o` has written them.
+
+    Args:
+        file: what `-o` has written.
+        small: how many times smaller a side of its depth maps has to be.
+
+    Raises:
+        InputError: the file cannot be used, or its depth maps have another size.
+    """
+    with as_input_error(file, "no figures ({reason}): give a file that -o has written"):
+        figures = json.loads(file.read_text())
+        file_small = figures["small"]
+        runs: dict[str, Rows] = figures["runs"]
+        _ = runs[DEFAULT]
+    if file_small != small:
+        raise InputError(
+            f"{file}: its depth maps are {file_small} times smaller, not {small}: give "
+            f"--small {file_small}"
+        )
+    return runs
 
 
 def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
@@ -486,6 +515,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = [DEFAULT, *(MECHANISMS if chosen.ledger else ()), *chosen.without]
     for name in {part for run in names[1:] for part in run.split("+")} - {*MECHANISMS}:
         parser.error(f"--without {name!r}: choose of {', '.join(MECHANISMS)}")
+    if chosen.output is not None:
+        check_writable(chosen.output)
     if chosen.photos:
         sheet(chosen.photos, names).save(chosen.output or "sheet.jpg")
         return
@@ -493,17 +524,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     folders = [path.parent for path in sorted(folder.glob("*/scene.json"))] or pictures_in(
         folder, CUT_PHOTOS
     )
+    names_there = ", ".join(path.name for path in folders)
     folders = [
         path for path in folders if any(word in path.name for word in chosen.scenes.split(","))
     ]
     if not folders:
-        parser.error(f"{chosen.folder}: no folder with a scene.json in it, and no photo")
-    before = json.loads(chosen.against.read_text()) if chosen.against else None
-    if before and before["small"] != chosen.small:
-        parser.error(
-            f"{chosen.against}: its depth maps are {before['small']} times smaller, not "
-            f"{chosen.small}"
-        )
+        raise InputError(f"--scenes {chosen.scenes}: in no scene's name: there are {names_there}")
+    before = read_figures(chosen.against, chosen.small) if chosen.against else None
     network = load_features("squeezenet", chosen.features) if chosen.features else None
     perception = Perception(network) if network else None
     runs: dict[str, Rows] = {name: {} for name in names}
@@ -525,8 +552,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if len(runs) > 1:
         print(f"\n{ledger(runs)}")
     if before:
-        print(f"\n{comparison(before['runs'][DEFAULT], runs[DEFAULT])}")
+        print(f"\n{comparison(before[DEFAULT], runs[DEFAULT])}")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

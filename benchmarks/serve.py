@@ -29,6 +29,10 @@ from typing import Any
 
 from PIL import Image
 
+from spackle.cli.script_command import run_script
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import check_writable
+
 TOKEN, SCENES, BOUNDARY = "benchmark", "/api/v1/scenes", "7d1"
 
 
@@ -276,6 +280,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
+    for name in ("side", "photos", "workers"):
+        if getattr(given, name) < 1:
+            raise InputError(f"--{name} {getattr(given, name)}: must be at least 1")
+    if given.output is not None:
+        check_writable(given.output)
     random.seed(given.seed)
     content = photo(given.side)
     results: dict[str, Any] = {
@@ -295,4 +304,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

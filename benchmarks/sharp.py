@@ -210,6 +210,17 @@ def main() -> None:
         (run_original if "checkout" in call else run_ours)(clock, *paths, **call)
         print(json.dumps(clock.seconds))
         return
+
+    # Not for the child, whose first stage is the import, and where Spackle may not be installed.
+    from spackle.runtime.errors import InputError
+    from spackle.runtime.files import check_file
+
+    if chosen.weights is not None:
+        check_file(chosen.weights, "file of SHARP's weights")
+    if chosen.photo is not None:
+        check_file(chosen.photo, "photo")
+    if chosen.original is not None and not (chosen.original / "src" / "sharp").is_dir():
+        raise InputError(f"{chosen.original}: has no src/sharp: give a clone of apple/ml-sharp")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         weights, photo = make_inputs(chosen.weights, chosen.photo, folder)
@@ -234,4 +245,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--child"]:  # the original's Python may have no Spackle
+        main()
+    else:
+        from spackle.cli.script_command import run_script
+
+        sys.exit(run_script(main))

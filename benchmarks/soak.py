@@ -33,6 +33,9 @@ from typing import Any
 
 from PIL import Image
 
+from spackle.cli.script_command import run_script
+from spackle.runtime.files import check_writable
+
 TOKEN = "soak-test-token-0123"
 SCENES = "/api/v1/scenes"
 BOUNDARY = "7d1"
@@ -442,6 +445,8 @@ def main() -> None:
     if given.watch is not None:
         watch(given.port, given.watch)
         return
+    if given.output is not None:
+        check_writable(given.output)
     text = json.dumps(soak(given.jobs, given.minutes), indent=1)
     print(text)
     if given.output:
@@ -449,4 +454,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

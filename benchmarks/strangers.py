@@ -42,12 +42,12 @@ from scoreboard import markdown, sign_test
 from torch import Tensor
 
 from spackle.bases.settings import BaseSettings
-from spackle.cli.options import BAD_INPUT
+from spackle.cli.script_command import run_script
 from spackle.core.image_files import read_image
 from spackle.core.photo import load_photo
 from spackle.formats import save_png
 from spackle.pipeline import FillOptions, Pipeline, PipelineOptions
-from spackle.runtime.errors import InputError, as_input_error, printable_line
+from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file, check_writable, list_files, write_atomic, write_json
 from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Reporter
@@ -579,16 +579,10 @@ def run(chosen: argparse.Namespace) -> None:
         print(table_of_files(chosen.readings, chosen.key))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one of the commands; returns the exit code: 0, or 2 after a line about bad input."""
-    chosen = parser().parse_args(arguments)
-    try:
-        run(chosen)
-    except InputError as error:
-        print(f"error: {printable_line(str(error))}", file=sys.stderr)
-        return BAD_INPUT
-    return 0
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one of the commands; InputError if its input or output cannot be used."""
+    run(parser().parse_args(arguments))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(main))

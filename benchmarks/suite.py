@@ -18,7 +18,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +35,7 @@ from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
+from spackle.cli.script_command import run_script
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
@@ -68,7 +69,7 @@ from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
 from spackle.runtime.device import hardware_facts, package_versions, parallel_for_chunks
 from spackle.runtime.errors import InputError, check_name
-from spackle.runtime.files import write_atomic, write_json
+from spackle.runtime.files import check_file, write_atomic, write_json
 from spackle.runtime.folders import make_folder
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 from spackle.video.encoding import save_video
@@ -377,7 +378,7 @@ TITLES = {
 }
 
 
-def main(arguments: list[str]) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -406,12 +407,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--windows", type=int, help="of SHARP, at once")
     options = parser.parse_args(arguments)
     chosen = ["limits", *(name for name in options.only.split(",") if name != "limits")]
-    try:
-        for name in chosen:
-            check_name("--only", name, tuple(TITLES))
-        make_folder(options.output)
-    except InputError as error:
-        parser.error(str(error))
+    for name in chosen:
+        check_name("--only", name, tuple(TITLES))
+    for file in (options.checkpoint, options.residual):
+        if file is not None:
+            check_file(file, "file of weights")
+    make_folder(options.output)
     about = {**hardware_facts(torch.device(options.device)), **package_versions()}
     record: dict[str, Any] = {
         "commit": commit(),
@@ -476,4 +477,4 @@ def _number(value: float) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(run_script(main))

@@ -18,6 +18,10 @@ from pathlib import Path
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from spackle.cli.script_command import run_script
+from spackle.runtime.errors import as_input_error
+from spackle.runtime.folders import make_folder
+
 RUNS = {  # name: initial weights, and values that override the recipe cpu
     "first": (
         "",
@@ -38,11 +42,16 @@ SHIPPED = {"mixed": 0.1, "third": 0.4, "fourth": 0.5}
 
 
 def mean(files: Mapping[Path, float]) -> dict[str, Tensor]:
-    """The mean of files' weights, weighted by their shares, in float32."""
-    parts = [
-        {name: share * tensor.float() for name, tensor in load_file(file).items()}
-        for file, share in files.items()
-    ]
+    """The mean of files' weights, weighted by their shares, in float32.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    parts = []
+    for file, share in files.items():
+        with as_input_error(file, "no weights ({reason}): delete its run to train it again"):
+            tensors = load_file(file)
+        parts.append({name: share * tensor.float() for name, tensor in tensors.items()})
     return {name: sum((part[name] for part in parts[1:]), parts[0][name]) for name in parts[0]}
 
 
@@ -58,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "overrides", nargs="*", metavar="KEY=VALUE", help="of every run: where the data lies"
     )
     options = parser.parse_intermixed_args(arguments)
+    make_folder(options.output)
 
     def file(name: str) -> Path:
         folder: Path = options.output
@@ -91,4 +101,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(main))

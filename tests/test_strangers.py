@@ -11,6 +11,7 @@ import strangers
 from PIL import Image
 
 from spackle.bases.settings import BaseSettings
+from spackle.cli.script_command import run_script
 from spackle.pipeline import FillOptions, PipelineOptions
 from spackle.views import PathOptions
 
@@ -215,7 +216,7 @@ def assert_refused(
     command: str, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The command prints one line, which has these words, and ends with exit code 2."""
-    assert strangers.main(command.split()) == 2
+    assert run_script(lambda: strangers.main(command.split())) == 2
     output, error = capsys.readouterr()
     assert output == ""
     assert error.startswith("error: ")
@@ -246,8 +247,8 @@ def assert_refused(
         ("ends list.txt -o list.txt", ("list.txt: cannot create this output folder",)),
         ("ends list.txt -o list.txt/e", ("list.txt/e: cannot create this output folder",)),
         ("ends list.txt -o e --frames 3", ("--frames 3: must be a multiple of 4",)),
-        ("ends list.txt -o e --overscan -1", ("`overscan` must be between", "-1")),
-        ("ends list.txt -o e --fill wood", ("`fill` wood is unknown",)),
+        ("ends list.txt -o e --overscan -1", ("--overscan must be between", "-1")),
+        ("ends list.txt -o e --fill wood", ("--fill wood is unknown",)),
         ("sheets nowhere -o s --key k.json", ("nowhere: cannot read the folder",)),
         ("sheets list.txt -o s --key k.json", ("list.txt: cannot read the folder",)),
         ("sheets empty -o s --key k.json", ("empty: has no NAME_left.png", "`ends`")),

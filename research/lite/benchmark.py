@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,12 +37,15 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from spackle.bases.lite import LiteBase
+from spackle.cli.script_command import run_script
 from spackle.core.photo import load_photo
 from spackle.formats import save_png
 from spackle.formats.png import contact_sheet
 from spackle.paper.evaluation.datasets.stereo import pair_of_2014
 from spackle.paper.training.measured_photos import find_photo_files
 from spackle.paper.training.recipe import RgbdFolder
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import check_writable
 
 GUESSES = ("constant", "ramp", "lite")
 STREETS, STREETS_SEED = 40, 202
@@ -50,12 +54,13 @@ STREETS, STREETS_SEED = 40, 202
 def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]]:
     """Yield groups of frames with their names."""
     for folder in arguments.stereo:
+        with as_input_error(folder, "cannot read the folder of --stereo: {reason}", OSError):
+            content = sorted(folder.iterdir())
         plain = [
-            scene
-            for scene in sorted(folder.iterdir())
-            if not (scene / "scene.json").is_file() and scene.is_dir()
+            scene for scene in content if not (scene / "scene.json").is_file() and scene.is_dir()
         ]
-        if len(plain) < len(list(folder.iterdir())):
+        # An empty folder has no scenes of either kind, and `of_scenes` says so.
+        if len(plain) < len(content) or not content:
             yield folder.name, [file.read(JUDGED_SIDE) for file in of_scenes(folder, "--stereo")]
         for scene in plain:
             case = pair_of_2014(scene)
@@ -145,6 +150,15 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--standing", type=Path)
     arguments = parser.parse_args()
+    if len(arguments.rgbd) != len(arguments.unit):
+        folders = " ".join(map(str, arguments.rgbd))
+        raise InputError(f"--rgbd {folders}: has {len(arguments.unit)} --unit: give one for each")
+    if arguments.standing:
+        find_photo_files(arguments.standing, "--standing")  # before all else, which takes minutes
+    if arguments.pictures:
+        check_writable(arguments.pictures)
+        if not (arguments.stereo or arguments.rgbd or arguments.rooms):
+            raise InputError("--pictures: of nothing: give --stereo, --rgbd or --rooms")
     base = LiteBase.load(arguments.weights)
 
     print(
@@ -194,4 +208,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

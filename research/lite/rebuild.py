@@ -19,6 +19,7 @@ from train import main as train
 from weights import save_networks
 
 from spackle.bases.lite import LiteNet, load_networks
+from spackle.cli.script_command import run_script
 
 SMALL = "network=lite0 data.scales=[1] optim.warmup=60"
 RUNS = {  # name: initial weights, teacher, and values that override lite.yaml
@@ -105,4 +106,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(main))

@@ -8,13 +8,16 @@ Debian's packages are downloaded and unpacked below the cache folder: WORLDS_CAC
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from spackle.cli.script_command import run_script
 from spackle.runtime.errors import InputError
+from spackle.runtime.folders import make_folder
 from worlds.library import Library
 
 PACKAGES = ("sweethome3d-furniture", "sweethome3d")
@@ -49,9 +52,9 @@ def download(packages: Sequence[str], archives: Path, root: Path) -> None:
         root: the folder to unpack into; it becomes their root folder, with "usr" in it.
 
     Raises:
-        InputError: apt-get or dpkg is missing or fails.
+        InputError: the folder cannot be made, or apt-get or dpkg is missing or fails.
     """
-    archives.mkdir(parents=True, exist_ok=True)
+    make_folder(archives)
     try:
         subprocess.run(["apt-get", "download", *packages], cwd=archives, check=True)
         for archive in sorted(archives.glob("*.deb")):
@@ -71,6 +74,15 @@ def open_library(cache: Path | None = None) -> Library:
     return Library.open(folder / "library", catalogues, lambda line: print(line, file=sys.stderr))
 
 
-if __name__ == "__main__":
-    models = open_library().models
+def main() -> None:
+    """Fetch the models, and print how many there are."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, help="where models are kept")
+    models = open_library(parser.parse_args().cache).models
     print(f"{len(models)} models, {sum(model.triangles for model in models):,} triangles")
+
+
+if __name__ == "__main__":
+    sys.exit(run_script(main))

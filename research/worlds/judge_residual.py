@@ -26,6 +26,7 @@ from torch import Tensor
 
 from spackle.bases import BasePrediction
 from spackle.bases.depth import lift_rgbd
+from spackle.cli.script_command import run_script
 from spackle.core.camera import Camera
 from spackle.formats.png import contact_sheet, save_png
 from spackle.paper.training.feature_networks import FeatureNet, load_features
@@ -36,11 +37,14 @@ from spackle.residual.architectures import SHIPPED, load_residual
 from spackle.residual.features import hole_mask
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError
+from spackle.runtime.files import check_writable
 from spackle.scene_fill import FillContext, fill_view
 from spackle.scene_fill.texture import exemplar_texture
 from worlds.second_views import DEPTH_KINDS, PHOTO_VIEW, as_colors, base_of_world, is_usable
 from worlds.shards import read_view, world_keys
 
+PAIR_FILES = "*/scene.json"  # in a folder of stereo pairs
+ARCHIVES = "worlds-*.tar"  # in a folder of made rooms
 # The numbers of the second views of a world that are judged: two of six, numbered from 1.
 JUDGED_VIEWS = (1, 4)
 # Least share of a view that its hole has: figures of a few pixels would count as much as others.
@@ -78,23 +82,31 @@ class Judgement(NamedTuple):
     pictures: list[list[Tensor]]  # for each view: the base's rendering, completed views, the truth
 
 
-def views_of_pairs(folder: Path) -> Iterator[JudgedView]:
-    """The right cameras' views of all stereo pairs in a folder."""
-    for file in sorted(folder.glob("*/scene.json")):
+def files_in(folder: Path, pattern: str) -> list[Path]:
+    """The sorted files in a folder whose names match a pattern; InputError if there are none."""
+    files = sorted(folder.glob(pattern))
+    if not files:
+        raise InputError(f"{folder}: has no {pattern}: give another folder")
+    return files
+
+
+def views_of_pairs(files: Sequence[Path]) -> Iterator[JudgedView]:
+    """The right cameras' views of stereo pairs, each given by its file scene.json."""
+    for file in files:
         pair = load_pair(file.parent)
         base = lift_rgbd(pair.left, pair.depth, pair.left_camera)
         yield JudgedView("pairs", base, pair.right_camera, pair.right)
 
 
-def views_of_worlds(folder: Path) -> Iterator[JudgedView]:
-    """Second views of the first worlds of all archives of rooms in a folder.
+def views_of_worlds(archives: Sequence[Path]) -> Iterator[JudgedView]:
+    """Second views of the first worlds of archives of rooms.
 
     Of each archive the first world's photo is lifted by its true depth, the second's by true depth
     with wrong outlines, the third's by the depth that `lite` guesses (`DEPTH_KINDS`); each kind is
     a group of its own.
     """
     renderer = get_renderer()
-    for archive in sorted(folder.glob("worlds-*.tar")):
+    for archive in archives:
         # One world for each kind; an archive may have fewer worlds than there are kinds.
         for number, (key, kind) in enumerate(zip(world_keys(archive), DEPTH_KINDS, strict=False)):
             try:
@@ -192,8 +204,8 @@ def print_table(figures: dict[str, list[list[HoleFigures]]], names: Sequence[str
             print(f"| {group} | {name} | {means} | {is_less[:, index].sum()} of {len(views)} |")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Judge weights and print a table of them; returns the exit status: 0, or 2 for bad input."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Judge weights and print a table of them; InputError if the input cannot be used."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -219,24 +231,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sheet", type=Path, help="a PNG file: each view incomplete, completed by all, and true"
     )
     options = parser.parse_args(arguments)
-    try:
-        networks = [open_network(name) for name in options.weights]
-        features = load_features("squeezenet", options.features)
-        assert features is not None  # None is only for the name "none"
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    views: list[JudgedView] = []
-    if options.pairs:
-        views += views_of_pairs(options.pairs)
-    if options.worlds:
-        views += views_of_worlds(options.worlds)
+    networks = [open_network(name) for name in options.weights]
+    if options.pairs is None and options.worlds is None:
+        raise InputError("--pairs or --worlds: give at least one of them")
+    pairs = [] if options.pairs is None else files_in(options.pairs, PAIR_FILES)
+    archives = [] if options.worlds is None else files_in(options.worlds, ARCHIVES)
+    if options.sheet is not None:
+        check_writable(options.sheet)
+    features = load_features("squeezenet", options.features)
+    assert features is not None  # None is only for the name "none"
+    views = [*views_of_pairs(pairs), *views_of_worlds(archives)]
     figures, pictures = judge(views, networks, features, options.alone)
     print_table(figures, options.weights)
     if options.sheet:
         save_png(contact_sheet(pictures, SHEET_SIDE_PX), options.sheet)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(main))

@@ -8,12 +8,15 @@ Each is seen from the front, above and to the right, in plain light, with its na
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from spackle.cli.script_command import run_script
+from spackle.runtime.folders import make_folder
 from worlds.caster import World
 from worlds.fetch import open_library
 from worlds.library import Library, Model
@@ -57,8 +60,7 @@ def model_picture(library: Library, model: Model, side: int) -> NDArray[np.uint8
 
 
 def sheets(library: Library, output: Path) -> None:
-    """Write the sheets models-00.png and so on, sorted by category."""
-    output.mkdir(parents=True, exist_ok=True)
+    """Write the sheets models-00.png and so on into a folder, sorted by category."""
     models = sorted(library.models, key=lambda model: (model.entry.category, model.entry.key))
     tile_height = SIDE_PX + CAPTION_PX
     for first in range(0, len(models), PER_SHEET):
@@ -81,9 +83,10 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=None, help="where models are kept")
     parser.add_argument("--torcs", action="store_true", help="the second set: tracks and cars")
     options = parser.parse_args()
+    make_folder(options.output)
     library = open_torcs(options.cache) if options.torcs else open_library(options.cache)
     sheets(library, options.output)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

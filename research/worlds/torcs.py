@@ -10,6 +10,7 @@ that anyone may use.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import re
 import sys
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spackle.cli.script_command import run_script
 from spackle.runtime.errors import InputError
 from worlds.ac3d_files import read_ac3d
 from worlds.catalogue import Entry
@@ -248,7 +250,16 @@ def _number(facts: str, section: str, name: str) -> float:
     return float(value.group(1))
 
 
-if __name__ == "__main__":
-    for model in open_torcs().models:
+def main() -> None:
+    """Fetch the models, and print a line for each, with its terms and creators."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cache", type=Path, help="where models are kept")
+    for model in open_torcs(parser.parse_args().cache).models:
         entry = model.entry
         print(f"{entry.key}: {model.triangles:,} triangles, {entry.licence}, {entry.creator}")
+
+
+if __name__ == "__main__":
+    sys.exit(run_script(main))

@@ -6,6 +6,7 @@ PYTHONPATH=src:research python -m worlds.world_sheet FOLDER -o sheet.png --count
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from spackle.cli.script_command import run_script
 from spackle.runtime.errors import InputError
+from spackle.runtime.files import check_writable
 from worlds.shards import ROOMS_PREFIX, StoredView, read_view, world_keys
 
 Bytes = NDArray[np.uint8]
@@ -98,12 +101,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--prefix", default=ROOMS_PREFIX, help="how archives' names begin: worlds, streets, tracks"
     )
     options = parser.parse_args(arguments)
-    try:
-        picture = sheet(options.folder, options.count, options.views, options.first, options.prefix)
-    except InputError as error:
-        parser.error(str(error))
+    check_writable(options.output)
+    picture = sheet(options.folder, options.count, options.views, options.first, options.prefix)
     Image.fromarray(picture).save(options.output)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_script(main))

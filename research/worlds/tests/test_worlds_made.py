@@ -21,6 +21,8 @@ from worlds.plans import WorldPlan
 from worlds.rooms import furnish
 from worlds.shards import read_view, shard_file, world_facts, world_keys, write_shard
 
+from spackle.cli.script_command import run_script
+
 pytestmark = pytest.mark.slow
 SIZE = (48, 64)
 
@@ -221,8 +223,8 @@ def test_a_sheet_of_a_folder_without_worlds_says_so_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = [str(tmp_path), "-o", str(tmp_path / "sheet.png"), "--prefix", "streets"]
-    with pytest.raises(SystemExit) as ended:
-        world_sheet.main(arguments)
-    assert ended.value.code == 2
-    assert "no world to show in archives streets-NNNNN.tar" in capsys.readouterr().err
+    assert run_script(lambda: world_sheet.main(arguments)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path}: no world to show in archives streets-NNNNN.tar")
+    assert error.count("\n") == 1
     assert not (tmp_path / "sheet.png").exists()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 
-from worlds.judge_residual import judge, views_of_worlds
+from worlds.judge_residual import ARCHIVES, files_in, judge, views_of_worlds
 from worlds.photo_camera import Development, developed, photographed
 from worlds.second_views import (
     DEPTH_KINDS,
@@ -249,7 +249,7 @@ def test_training_in_miniature_learns_from_worlds_and_resumes(
 
 def test_weights_are_judged_in_the_holes_of_the_true_second_views(tmp_path: Path) -> None:
     write_worlds(shard_file(tmp_path, 7), first=0, count=1)
-    views = list(views_of_worlds(tmp_path))
+    views = list(views_of_worlds(files_in(tmp_path, ARCHIVES)))
     assert {view.group for view in views} == {"worlds, true"}
 
     def features(images: Tensor) -> list[Tensor]:

@@ -6,13 +6,12 @@ They have recipes and tasks of their own, and begin by `python FILE` instead of 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from spackle.cli.options import BAD_INPUT, INTERRUPTED
-from spackle.runtime.errors import InputError
+from spackle.cli.options import INTERRUPTED
+from spackle.cli.script_command import run_script
 
 if TYPE_CHECKING:  # torch takes seconds to load
     import torch
@@ -61,16 +60,13 @@ def run_training_command(
         "--overwrite", action="store_true", help="start anew where the folder holds a run"
     )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help=overrides_help)
-    # Overrides may stand before, between and behind the options.
-    options = parser.parse_intermixed_args(arguments)
 
-    try:
+    def train_as_told() -> int:
+        """Read the command line, and train; the exit code tells whether the training has ended."""
+        # Overrides may stand before, between and behind the options.
+        options = parser.parse_intermixed_args(arguments)
         recipe = load_recipe(recipe_kind, options.recipe, options.overrides)
         end_reason = train(recipe, open_task, options.output, Reporter(), options.overwrite)
-    except InputError as error:
-        # If several processes train together, one reports the error, and the others' is empty.
-        message = str(error)
-        if message:
-            print(f"error: {message}", file=sys.stderr)
-        return BAD_INPUT
-    return INTERRUPTED if end_reason == "stopped" else 0
+        return INTERRUPTED if end_reason == "stopped" else 0
+
+    return run_script(train_as_told)
