@@ -48,7 +48,7 @@ DEFAULT_VIDEO_SECONDS = 4.0  # duration of a video along a trajectory
 MAX_OVERSCAN = 0.5  # focal length times 1.5, which leaves 44 % of the photo's area
 MAX_REPORTED_KEYFRAMES = 16  # the report measures the holes of at most so many keyframes
 
-NEARLY_NO_PX = 0.01  # by so little, views that show the same may seem to differ
+NEARLY_NO_PX = 0.01  # two views that show the same may differ by this much, by rounding errors
 DISPARITY_STEP = 0.01  # `choose_disparity` rounds the disparity down to a multiple of this step
 MIN_CHOSEN_DISPARITY = 0.04  # a smaller movement shows no parallax
 MAX_TRIALS = 3  # disparities that `choose_disparity` tries besides the base's usual one
@@ -433,13 +433,14 @@ class PlannedViews:
     reported_views: dict[str, int]
     # Not every frame of a long video, because neighbours in a path show the same holes.
     views_to_fill: list[int]
-    # Views that are filled instead of frames, which they show with a margin; and their frames.
+    # Some views show a frame with a margin around it, and are filled in the frame's place. For each
+    # of them, the frame's view.
     frame_within: dict[int, int]
-    # The first views of `cameras` are this number of views that are shown in the video, reported or
-    # given; those after them are only filled.
+    # The first `shown_view_count` views of `cameras` are shown in the video, reported or given;
+    # those after them are only filled.
     shown_view_count: int
-    # The first views of `cameras` are this number of views that the user gave. They are also saved
-    # as pictures.
+    # The first `given_view_count` views of `cameras` were given by the user. They are also saved as
+    # pictures.
     given_view_count: int
     frame_maker: FrameMaker  # makes a frame of the video from the renderings of its views
 
@@ -464,7 +465,7 @@ class Margin(NamedTuple):
         size = corners.new_tensor([view.width, view.height])
 
         def whole_pixels(lengths: Tensor) -> list[int]:
-            """Lengths rounded up, but for errors of rounding."""
+            """Lengths rounded up; 0.01 pixels more than a whole number are a rounding error."""
             return (lengths - NEARLY_NO_PX).ceil().clamp_min(0).int().tolist()
 
         left, top = whole_pixels(-corners.amin(0))
@@ -487,7 +488,7 @@ class _PathViews:
 
     frame_cameras: list[Camera]  # of the video's frames; of a stereo video, midway between the eyes
     filled_frame_step: int = 1  # every first, second, … of these frames is filled
-    # By how much the filled view of each frame is larger than the frame.
+    # For each frame, by how much the view that is filled in its place is larger; empty: by nothing.
     filled_margins: list[Margin] = dataclasses.field(default_factory=list)
     reported_cameras: dict[str, Camera] = dataclasses.field(default_factory=dict)  # by name
 
@@ -554,17 +555,25 @@ def _trajectory_views(
         prediction.gaussians, prediction.camera, depth_range, usual_disparity, renderer
     )
     frame_cameras = path.video_cameras(
-        depth_range, prediction.camera, None, usual_disparity, framing
+        depth_range,
+        prediction.camera,
+        keyframes=None,
+        disparity=usual_disparity,
+        framing=framing,
     )
-    camera = prediction.camera.even()
-    disparity = path.disparity_or(prediction.max_disparity)
+    camera = prediction.camera.even()  # of even width and height, as videos need
+    disparity = path.disparity_or(usual_disparity)
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
     # The framing of the video hides what lies beyond the photo's border. Other programs show the
     # scene without it: through the photo's own lens, and with the usual target. So frames are
     # filled with margins around them, with which they also show this.
     usual_cameras = path.video_cameras(
-        depth_range, prediction.camera, None, usual_disparity, framing=None
+        depth_range,
+        prediction.camera,
+        keyframes=None,
+        disparity=usual_disparity,
+        framing=None,
     )
     filled_margins = [
         Margin.to_show(frame, usual)
@@ -593,11 +602,11 @@ def _keyframe_views(
         prediction.camera,
         keyframes,
         prediction.max_disparity,
-        framing=None,
+        framing=None,  # keyframes say themselves where the camera looks and how much it zooms
     )
     key_cameras = keyframes.at(
         [key.time for key in keyframes.keys],
-        prediction.camera.even(),
+        prediction.camera.even(),  # of even width and height, as videos need
         prediction.depth_range,
     )
     key_step = math.ceil(len(key_cameras) / MAX_REPORTED_KEYFRAMES)

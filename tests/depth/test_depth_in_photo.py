@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 from typing import Any
 
@@ -172,6 +173,25 @@ def test_the_map_is_upright_as_the_photo_is(tmp_path: Path, kind: str, orientati
     as_stored = found(tmp_path, f"{kind}, turned 1").depth.numpy()
     np.testing.assert_array_equal(depth.depth.numpy(), upright(as_stored, orientation))
     depth.check_aspect_ratio(photo.height, photo.width, depth.path)
+
+
+@pytest.mark.parametrize(
+    ("least", "greatest"),
+    [(2.0, 2.0), (3.0, 2.0), (-2.0, -1.0), (1.0, math.inf), (math.nan, 2.0)],
+)
+def test_an_impossible_range_of_hevc_is_refused_where_it_is_read(
+    least: float, greatest: float
+) -> None:
+    disparity = {"representation_type": 1, "d_min": least, "d_max": greatest}
+    depth = {"representation_type": 2, "z_near": least, "z_far": greatest}
+    for stated in (disparity, depth):
+        with pytest.raises(ValueError, match=r"nothing can lie|it announces"):
+            layouts.hevc_scale(stated)
+
+
+def test_the_farthest_depth_of_hevc_may_be_the_horizon() -> None:
+    scale = layouts.hevc_scale({"representation_type": 0, "z_near": 2.0, "z_far": math.inf})
+    assert (scale.quantity, scale.first, scale.last) == ("disparity", 0.0, 0.5)
 
 
 def test_photos_without_depth(tmp_path: Path) -> None:

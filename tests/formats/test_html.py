@@ -96,6 +96,12 @@ def test_harmonics_are_read_back_as_precisely_as_they_are_small(degree: int) -> 
     assert bool(((values - wanted).abs() <= 0.51 * steps).all())
 
 
+def test_harmonics_of_zero_are_read_back_as_zero() -> None:
+    data, limit = encode_harmonics(torch.full((4, 3), 0.5), torch.zeros(4, 8, 3))
+    assert limit == 0
+    assert data == bytes([128]) * 3 * (1 + 8) * 4
+
+
 def test_harmonics_are_a_file_of_the_layer_that_has_some() -> None:
     plain = page_scene("a", BOX.base(), BOX.base(), BOX.camera)
     assert set(plain.files) == {"base.splats", "aux.splats"}

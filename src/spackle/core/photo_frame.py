@@ -16,10 +16,10 @@ MAX_FRAME_RATIO = 0.25  # widest side of a frame, as a share of the photo's widt
 # Colours are compared by the largest difference of a channel of sRGB in 0..1.
 MAX_FRAME_NOISE = 9 / 255  # mean difference of a frame's line from the frame's colour
 MIN_PICTURE_CONTRAST = 20 / 255  # difference of a pixel that does not belong to the frame
-MIN_STRAIGHT_RATIO = 0.8  # share of an inner edge's pixels that must differ so much
+MIN_STRAIGHT_RATIO = 0.8  # share of an inner edge's pixels that must have this difference
 BLURRED_EDGE_PX = 6  # width of a blurred inner edge
 
-# A rim is at most so wide: 6 pixels, or a share of the photo's width or height.
+# A rim is at most this wide: 6 pixels or, if that is more, this share of the width or height.
 MAX_RIM_PX = 6
 MAX_RIM_RATIO = 0.01
 MIN_RIM_CONTRAST = 20 / 255  # of the outermost line to the picture inside
@@ -178,15 +178,17 @@ class _Side:
         A rim is darker or brighter than the picture inside along most of the side, and the picture
         inside varies much less.
         """
+        # `_lines` [N, M, 3] are N lines of M pixels, from the picture's border inwards. The first
+        # `max_width` lines may be a rim. The next `max_width` lines show how much the picture
+        # inside varies. The 6 lines (MAX_RIM_PX) after these are the reference for both.
         max_width = max(MAX_RIM_PX, int(MAX_RIM_RATIO * len(self._lines)))
-        # Inside of a rim, as many lines must be calm, and a few more are compared with.
         reference_start = 2 * max_width
         brightness = self._lines[: reference_start + MAX_RIM_PX].mean(axis=-1)  # [n, M]
         if len(brightness) <= reference_start:
             return 0
-        inside = brightness[reference_start:].mean(axis=0)  # [M]
-        differences = brightness[:reference_start] - inside  # [2·max_width, M]
-        contrasts = np.median(differences, axis=1)
+        reference = brightness[reference_start:].mean(axis=0)  # [M]
+        differences = brightness[:reference_start] - reference  # [2·max_width, M]
+        contrasts = np.median(differences, axis=1)  # [2·max_width] of each line
 
         # Most pixels of the outermost line must differ, and to the same side.
         rim_contrast = contrasts[0]
@@ -194,8 +196,9 @@ class _Side:
         if abs(rim_contrast) < MIN_RIM_CONTRAST or differs.mean() < MIN_STRAIGHT_RATIO:
             return 0
 
+        # The rim ends at the first line that is like the reference.
         ratios = np.abs(contrasts / rim_contrast)
         has_ended = ratios < MAX_BLURRED_RIM
-        width = int(has_ended.argmax())  # 0 if no line is so much like the inside
+        width = int(has_ended.argmax())  # 0 if there is no such line
         is_calm = bool((ratios[width:] < MAX_INSIDE_VARIATION).all())
         return width if 0 < width <= max_width and is_calm else 0

@@ -69,7 +69,7 @@ def refuse_other_projections(
     Args:
         path: the photo's file, for the message.
         exif: its tags, by number.
-        xmp: its packet of XMP; empty without.
+        xmp: its packet of XMP; empty if it has none.
         width: of the picture in pixels.
         height: of the picture in pixels.
     """
@@ -93,7 +93,11 @@ def refuse_other_projections(
 
 
 def _projection_of_xmp(xmp: bytes) -> str | None:
-    """Which projection XMP states, with its extent; None for a flat picture or no statement."""
+    """Which projection XMP states, as words for the brackets of the message "a panorama (…)".
+
+    Such as "cylindrical" or "equirectangular, 180° of 360°". None for a flat picture, or if no
+    projection is stated.
+    """
     # Most photos do not name the namespace of panoramas, and need not be parsed.
     if _GPANO.strip("{}").encode() not in xmp:
         return None
@@ -105,20 +109,24 @@ def _projection_of_xmp(xmp: bytes) -> str | None:
         full_width = find_number(tree, f"{_GPANO}FullPanoWidthPixels")
         cropped_width = find_number(tree, f"{_GPANO}CroppedAreaImageWidthPixels")
     except (ElementTree.ParseError, ValueError):
-        return "of a broken description"
+        return "of a broken description"  # in the message: "a panorama (of a broken description)"
     # Google's other entries, such as the number of photos, stand in ordinary photos, too.
     if not projection and full_width is None:
         return None
-    name = projection[:40] or "equirectangular"
+    name = projection[:40] or "equirectangular"  # the usual one, where only the size is stated
     if full_width is None or cropped_width is None or not 0 < cropped_width < full_width:
         return f"{name}, 360°" if name == "equirectangular" else name
     return f"{name}, {360 * cropped_width / full_width:.0f}° of 360°"
 
 
 def _fisheye_lens(exif: Mapping[int, object], xmp: bytes) -> str | None:
-    """The name of a fisheye that EXIF or XMP states; None for any other or a corrected picture."""
+    """The fisheye with which a photo was taken, as words for the message "a fisheye (…)".
+
+    That is the name of the lens in EXIF or XMP. None for other lenses, and for a picture whose
+    lines were straightened.
+    """
     if _CAMERA_MODEL_NAME.search(xmp):
-        return "its XMP says so"
+        return "its XMP says so"  # XMP states the kind of lens, not its name
     names = [str(exif.get(_TAG_LENS_MODEL, ""))]
     is_corrected = False
     try:
@@ -164,7 +172,7 @@ def looks_like_360(rgb: Tensor) -> bool:
 
 
 def xmp_of_image(image: Image.Image, exif: Mapping[int, object]) -> bytes:
-    """The packet of XMP that Pillow found in a picture; empty without."""
+    """The packet of XMP that Pillow found in a picture; empty if there is none."""
     # Where Pillow keeps it depends on the format: that of JPEG and WebP, of PNG, and of TIFF.
     for packet in (
         image.info.get("xmp"),

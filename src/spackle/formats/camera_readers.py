@@ -59,6 +59,10 @@ DATAPARSER_NAME = "dataparser_transforms.json"
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 DISTORTION_NOTE = "the distortion of its lenses is left out: views are those of pinholes"
 PICTURE_SUFFIXES = ("", ".png", ".jpg")  # which a name may leave out
+# A file of cameras has one of these keys: "frames" of nerfstudio, and of Spackle's own cameras;
+# "camera_path" of nerfstudio's viewer; "poses" of Record3D; "t_00", the first number of Polycam's
+# matrix. A file of keyframes has none of them.
+CAMERA_KEYS = ("frames", "camera_path", "poses", "t_00")
 
 KNOWN_KINDS = (
     "give Spackle's cameras (K and world_to_camera, docs/inputs.md), transforms.json of "
@@ -222,22 +226,22 @@ def read_camera_set(path: Path) -> CameraSet:
 
 
 def is_path_file(path: Path) -> bool:
-    """Return whether a file is to be read as one of Spackle's keyframes.
+    """Return whether a file is to be read as Spackle's keyframes, not as a set of cameras.
 
-    So is every file that is not known to hold cameras of another program, so that the message says
-    what a file of keyframes needs.
+    A file that is neither counts as keyframes, because the message of their reader says what a file
+    of a path needs.
     """
     file = _file_in_folder(path)
-    if file.is_dir():
+    if file.is_dir():  # of COLMAP or Polycam
         return False
+    # The reader of keyframes refuses other suffixes and files that are too large, and says why.
     if file.suffix.lower() != ".json" or check_file(file, "path file") > MAX_FILE_BYTES:
         return True
     content = _peek(file)
-    if isinstance(content, list):
+    if isinstance(content, list):  # the cameras of 3DGS
         return False
-    return not isinstance(content, dict) or not {"frames", "camera_path", "poses", "t_00"} & set(
-        content
-    )
+    has_cameras = isinstance(content, dict) and any(key in content for key in CAMERA_KEYS)
+    return not has_cameras
 
 
 def camera_source_files(path: Path) -> list[Path]:
@@ -254,9 +258,10 @@ def camera_source_files(path: Path) -> list[Path]:
 
 
 def _file_in_folder(path: Path) -> Path:
-    """Return the file with a folder's cameras; the folder itself if many files have them.
+    """Return the file that holds the cameras of `path`, or a folder whose files hold them together.
 
-    Of a file of a COLMAP model, the folder is returned.
+    That is `path` itself if it is a file, but the folder of a file of a COLMAP model. For a folder
+    it is the file of cameras in it, if there is a single one.
     """
     if path.is_file() and path.stem in ("cameras", "images") and path.suffix in (".bin", ".txt"):
         return path.parent
@@ -278,7 +283,7 @@ def _read_folder(folder: Path) -> CameraSet:
 
 
 def _peek(path: Path) -> Any:
-    """Return the parsed JSON of a file; None if it is none, which a pydantic model then refuses."""
+    """Return the parsed JSON of a file; None if it is no JSON, which pydantic models refuse."""
     text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     try:
         return json.loads(text)
@@ -319,7 +324,7 @@ def _read_nerfstudio(path: Path, content: Any) -> CameraSet:
     cameras = []
     for index, frame in enumerate(file.frames):
         where = f"{path}: frame {index}"
-        # What a frame does not say holds for all frames.
+        # The file states a lens for all frames; what a frame states itself replaces it.
         lens = file.model_dump(exclude={"frames", "ply_file_path"}, exclude_unset=True)
         lens |= frame.model_dump(
             exclude={"file_path", "transform_matrix"}, exclude_unset=True, exclude_none=True
@@ -474,7 +479,7 @@ def _read_nerfstudio_path(path: Path, content: Any) -> CameraSet:
 
 
 def _seconds_per_frame(fps: float, path: Path) -> float:
-    """Return the time of a frame; InputError for an impossible number of frames a second."""
+    """Return 1 / fps; InputError for an impossible number of frames a second."""
     if not 0 < fps <= MAX_FRAMES:
         raise InputError(f"{path}: fps must be positive, not {fps:g}")
     return 1 / fps
@@ -486,13 +491,13 @@ def _read_inria(path: Path, content: Any) -> CameraSet:
     if not is_inria:
         raise InputError(f"{path}: not a file of cameras: {KNOWN_KINDS}")
     file = _validated(_InriaFile, content, path)
-    # A program may have shuffled the list; the numbers tell the order in which pictures follow.
+    # A program may have shuffled the list; the ids tell the order of the pictures, if each camera
+    # has one of its own.
     ids = [entry.id for entry in file.root if entry.id is not None]
     entries = file.root
     if len(set(ids)) == len(entries):
-        entries = [
-            entry for _, entry in sorted(zip(ids, entries, strict=True), key=lambda of: of[0])
-        ]
+        numbered = sorted(zip(ids, entries, strict=True), key=lambda pair: pair[0])
+        entries = [entry for _, entry in numbered]
     cameras = []
     for index, entry in enumerate(entries):
         K = _intrinsics(entry.fx, entry.fy, entry.width / 2, entry.height / 2)
@@ -587,7 +592,7 @@ def _read_polycam(files: Sequence[Path]) -> CameraSet:
 
 
 def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
-    """Return K [3, 3] in float64."""
+    """Return K [3, 3] in float64, from focal lengths and principal point in pixels."""
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 

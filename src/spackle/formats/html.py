@@ -56,8 +56,7 @@ MAX_LIMIT = 1.0
 # 1 of the opacity.
 BYTES_PER_GAUSSIAN = 20
 
-# The steps of a byte of the harmonics to either side of 0.
-HARMONICS_STEPS = 127
+HARMONICS_STEPS = 127  # a byte of the harmonics has so many steps above 0 and as many below
 
 # A page with more bytes of Gaussians, 50,000 of them, is sent with coarser ones: a mail takes 10 or
 # 20 MB, and a phone should not wait.
@@ -237,8 +236,8 @@ def _encode_layers(
             "scaleLow": scale_low,
             "scaleStep": scale_step,
         }
-        # What completion adds has coefficients of 0, where it was joined to a scene that has
-        # others: they would only make the page larger.
+        # Gaussians that completion added to a scene with harmonics have harmonics of 0. These are
+        # left out, because they would only make the page larger.
         harmonics = gaussians.harmonics
         if harmonics is not None and bool(harmonics.any()):
             harmonics_file = f"{name}.harmonics"
@@ -344,10 +343,16 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
 def encode_harmonics(colors: Tensor, harmonics: Tensor) -> tuple[bytes, float]:
     """Pack the harmonics of N Gaussians for the page as byte planes.
 
-    A plane has one byte of each Gaussian. Each of the 1 + K vectors of three colours has three
-    planes: first what the constant colour exceeds 0..1 by in sRGB, which a layer has no room for;
-    then the coefficients, in their order. A byte 128 + s stands for ±(s / 127)² · limit with the
-    sign of s: most coefficients are small, and a single large one does not cost them precision.
+    A plane has one byte of each Gaussian. In their order, the planes hold:
+
+    * 3 planes: how far red, green and blue of the constant colour, in sRGB, lie above 1 or, with
+      a negative sign, below 0. `encode_layer` stores the constant colour cut to 0..1, and the page
+      adds what is stored here.
+    * 3 · K planes: red, green and blue of the first harmonic's coefficients, then of the second's,
+      and so on.
+
+    The byte 128 + s, with s from -127 to 127, stands for (s / 127)² · limit with the sign of s:
+    most coefficients are small, and a single large one does not cost them precision.
 
     Args:
         colors: [N, 3] linear RGB of the constant part.
@@ -361,12 +366,13 @@ def encode_harmonics(colors: Tensor, harmonics: Tensor) -> tuple[bytes, float]:
     srgb = extended_linear_to_srgb(colors.detach().to("cpu", torch.float32))
     excess = srgb - srgb.clamp(0, 1)
     limit = max(float(excess.abs().max()), float(harmonics.abs().max()))
+    divisor = limit if limit > 0 else 1.0  # if all values are 0, all bytes are 128
 
     planes = np.empty((3 + 3 * harmonics.shape[1], count), np.uint8)
     for start in range(0, count, GAUSSIANS_PER_BLOCK):
         block = slice(start, start + GAUSSIANS_PER_BLOCK)
         values = torch.cat([excess[block], harmonics[block].flatten(1)], dim=1)
-        steps = (values.abs() / limit).sqrt() * HARMONICS_STEPS
+        steps = (values.abs() / divisor).sqrt() * HARMONICS_STEPS  # 0 to 127
         planes[:, block] = _byte_planes(steps * values.sign() + 128)
     return planes.tobytes(), limit
 

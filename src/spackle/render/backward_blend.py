@@ -152,7 +152,7 @@ def backward_tile(
         ids: [n] indices of the tile's Gaussians, front to back.
         entry_needs: [n] bool: those whose sums are wanted.
         left, top: the tile's first pixel in the image.
-        sums: [m, 10] float32, zero at first: one row for each of these.
+        sums: [m, 10] float32, zero at first: one row for each Gaussian whose sums are wanted.
     """
     planes, notes, note_starts = buffers
     chunks = (len(ids) + CHUNK_GAUSSIANS - 1) // CHUNK_GAUSSIANS
@@ -169,8 +169,8 @@ def backward_tile(
             redraw_chunk(planes, notes, records, part, left, top, note_starts)
 
     # Back to front: draw each chunk once more, which writes its `notes`, and then visit its
-    # Gaussians from the last to the first, which reads them. `row` is the row of `sums` of the
-    # Gaussian that was visited last among those that need sums.
+    # Gaussians from the last to the first, which reads them. `row` counts down to the row of `sums`
+    # for each Gaussian that needs sums.
     row = len(sums)
     for chunk in range(chunks - 1, -1, -1):
         planes[:PLANE_FLOATS] = chunk_transmittance[chunk]
@@ -258,16 +258,16 @@ def redraw_row(
     """
     rate, center = parabola
     for x in range(TILE_PX):
-        i = offset + np.uint64(x)
-        n = note_start + np.uint64(x)
+        pixel = offset + np.uint64(x)  # its place in each plane
+        note = note_start + np.uint64(x)  # the place of its alpha; its transmittance is 16 behind
         distance = np.float32(x) - center
         alpha = alpha_from_log2(peak - rate * distance * distance)
-        transmittance = planes[i]
+        transmittance = planes[pixel]
         after = transmittance * (ONE - alpha)
         full = after <= TRANSMITTANCE_STOP_F32
-        planes[i] = ZERO if full else after
-        notes[n] = ZERO if full else alpha
-        notes[n + np.uint64(TILE_PX)] = transmittance
+        planes[pixel] = ZERO if full else after
+        notes[note] = ZERO if full else alpha
+        notes[note + np.uint64(TILE_PX)] = transmittance
 
 
 @kernel
@@ -283,7 +283,8 @@ def step_back(
 ) -> None:
     """Step back over a Gaussian: add it to what lies behind, and sum its gradients if needed.
 
-    The Gaussians of a tile are visited back to front, and this one lies behind the next one.
+    A tile's Gaussians are visited back to front. After its visit, a Gaussian counts as a part of
+    what lies behind those that are visited later.
 
     Args:
         planes: seven images of the tile, 256 floats each: transmittance, contribution of what lies
@@ -330,36 +331,40 @@ def step_back(
 def step_back_row(
     planes: Array, offset: np.uint64, notes: Array, note_start: np.uint64, color_and_depth: Numbers
 ) -> None:
-    """Step back over a row of a Gaussian whose own gradient nobody needs.
+    """Add a row of a Gaussian, whose own gradient nobody needs, to what lies behind.
 
-    This Gaussian lies behind the next one that is visited. So what it adds to the loss in each
-    pixel is added to the contribution of what lies behind: its weight times the sum of red, green,
-    blue, depth and 1 (for alpha), each multiplied by its gradient.
+    A tile's Gaussians are visited back to front. After its visit, a Gaussian counts as a part of
+    what lies behind those that are visited later. So in each of the row's 16 pixels, its own
+    contribution to the loss is added to that of all that lies behind: its weight (alpha ·
+    transmittance) times the sum of red, green, blue, depth and 1 (for alpha), each multiplied by
+    its gradient.
 
     Args:
-        planes: seven images of the tile, 256 floats each: transmittance, contribution of what lies
-            behind (changed here), gradients of red, green, blue, depth and alpha.
-        offset: where the row starts in a plane.
-        notes: alphas and transmittances of the row, from `note_start` on.
+        planes: seven images of the tile, 256 floats each, one after the other: transmittance,
+            contribution of what lies behind (changed here), gradients of red, green, blue, depth
+            and alpha.
+        offset: where the row starts in each plane.
+        notes: from `note_start` on, 16 alphas and then 16 transmittances of the row.
         note_start: where the row's note starts.
         color_and_depth: the Gaussian's red, green, blue and depth.
     """
     red, green, blue, depth = color_and_depth
     for x in range(TILE_PX):
-        i = offset + np.uint64(x)
-        n = note_start + np.uint64(x)
-        g = i + np.uint64(GRADIENT_PLANES)  # in the plane of red's gradient; then green, blue, …
+        pixel = offset + np.uint64(x)  # its place in each plane
+        red_place = pixel + np.uint64(GRADIENT_PLANES)  # of red's gradient, in `planes`
+        red_grad = planes[red_place]
+        green_grad = planes[red_place + np.uint64(PLANE_FLOATS)]
+        blue_grad = planes[red_place + np.uint64(2 * PLANE_FLOATS)]
+        depth_grad = planes[red_place + np.uint64(3 * PLANE_FLOATS)]
+        alpha_grad = planes[red_place + np.uint64(4 * PLANE_FLOATS)]
         # What one unit of this Gaussian's weight adds to the loss.
-        value = (
-            red * planes[g]
-            + green * planes[g + np.uint64(PLANE_FLOATS)]
-            + blue * planes[g + np.uint64(2 * PLANE_FLOATS)]
-        )
-        value += (
-            depth * planes[g + np.uint64(3 * PLANE_FLOATS)]
-            + planes[g + np.uint64(4 * PLANE_FLOATS)]
-        )
-        planes[i + np.uint64(BEHIND_PLANE)] += notes[n] * notes[n + np.uint64(TILE_PX)] * value
+        value = red * red_grad + green * green_grad + blue * blue_grad
+        value += depth * depth_grad + alpha_grad
+
+        note = note_start + np.uint64(x)  # the place of the pixel's alpha
+        alpha = notes[note]
+        transmittance = notes[note + np.uint64(TILE_PX)]  # behind the row's 16 alphas
+        planes[pixel + np.uint64(BEHIND_PLANE)] += alpha * transmittance * value
 
 
 @reordering_kernel
@@ -371,13 +376,17 @@ def step_back_and_sum_row(
     center: np.float32,
     color_and_depth: Numbers,
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
-    """Step back over a row of 16 pixels of a Gaussian, and sum its gradients over them.
+    """Add a row of 16 pixels of a Gaussian to what lies behind, and sum its gradients over them.
+
+    A tile's Gaussians are visited back to front. After its visit, a Gaussian counts as a part of
+    what lies behind those that are visited later.
 
     Args:
-        planes: seven images of the tile, 256 floats each: transmittance, contribution of what lies
-            behind (changed here), gradients of red, green, blue, depth and alpha.
-        offset: where the row starts in a plane.
-        notes: alphas and transmittances of the row, from `note_start` on.
+        planes: seven images of the tile, 256 floats each, one after the other: transmittance,
+            contribution of what lies behind (changed here), gradients of red, green, blue, depth
+            and alpha.
+        offset: where the row starts in each plane.
+        notes: from `note_start` on, 16 alphas and then 16 transmittances of the row.
         note_start: where the row's note starts.
         center: the Gaussian's middle in this row, in pixels of the tile.
         color_and_depth: its red, green, blue and depth.
@@ -395,23 +404,23 @@ def step_back_and_sum_row(
     sum_blue = ZERO
     sum_depth = ZERO
     for x in range(TILE_PX):
-        i = offset + np.uint64(x)
-        n = note_start + np.uint64(x)
-        g = i + np.uint64(GRADIENT_PLANES)
-        red_grad = planes[g]
-        green_grad = planes[g + np.uint64(PLANE_FLOATS)]
-        blue_grad = planes[g + np.uint64(2 * PLANE_FLOATS)]
-        depth_grad = planes[g + np.uint64(3 * PLANE_FLOATS)]
-        alpha_grad = planes[g + np.uint64(4 * PLANE_FLOATS)]
+        pixel = offset + np.uint64(x)  # its place in each plane
+        red_place = pixel + np.uint64(GRADIENT_PLANES)  # of red's gradient, in `planes`
+        red_grad = planes[red_place]
+        green_grad = planes[red_place + np.uint64(PLANE_FLOATS)]
+        blue_grad = planes[red_place + np.uint64(2 * PLANE_FLOATS)]
+        depth_grad = planes[red_place + np.uint64(3 * PLANE_FLOATS)]
+        alpha_grad = planes[red_place + np.uint64(4 * PLANE_FLOATS)]
         # What one unit of this Gaussian's weight adds to the loss.
         value = (
             red * red_grad + green * green_grad + blue * blue_grad + depth * depth_grad + alpha_grad
         )
-        alpha = notes[n]
-        transmittance = notes[n + np.uint64(TILE_PX)]
-        behind = planes[i + np.uint64(BEHIND_PLANE)]
+        note = note_start + np.uint64(x)  # the place of the pixel's alpha
+        alpha = notes[note]
+        transmittance = notes[note + np.uint64(TILE_PX)]  # behind the row's 16 alphas
+        behind = planes[pixel + np.uint64(BEHIND_PLANE)]
         weight = alpha * transmittance
-        planes[i + np.uint64(BEHIND_PLANE)] = behind + weight * value
+        planes[pixel + np.uint64(BEHIND_PLANE)] = behind + weight * value
 
         # A larger alpha shows more of this Gaussian and less of those behind; a clamped alpha has
         # no gradient.

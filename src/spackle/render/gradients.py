@@ -31,7 +31,7 @@ from spackle.runtime.device import parallel_for_chunks, thread_count
 from spackle.runtime.kernels import Array
 
 FIELDS_PER_SET = 5  # tensors of a set: means, quats, scales, opacities, colors
-IMAGES = 3  # of a rendering: rgb, depth, alpha
+IMAGES = 3  # number of a rendering's images: rgb, depth, alpha
 ARGUMENTS_BEFORE_TENSORS = 2  # of `DrawFunction.forward`: the camera and the tiles
 
 
@@ -66,8 +66,8 @@ def draw_with_gradients(
 class DrawFunction(torch.autograd.Function):
     """Draws sets of Gaussians over three images.
 
-    Autograd wants tensors as one flat sequence of arguments, so that of each set its five fields
-    are passed, one set after the other.
+    Autograd wants tensors as one flat sequence of arguments, so the five fields of each set are
+    passed one by one, set after set.
     """
 
     @staticmethod
@@ -107,12 +107,15 @@ class DrawFunction(torch.autograd.Function):
     def backward(ctx: Any, *image_gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Turn gradients of the three images into gradients of all arguments of `forward`.
 
-        These are the camera and the tiles, which are no tensors; three images that lie under the
-        drawing; and for each set of Gaussians its five fields (means, quats, scales, opacities,
-        colors). A gradient that nobody asked for is None.
+        Args:
+            ctx: holds what `forward` kept.
+            image_gradients: those of rgb [H, W, 3], depth [H, W] and alpha [H, W].
 
-        `ctx` has what `forward` kept, and `image_gradients` are those of rgb [H, W, 3],
-        depth [H, W] and alpha [H, W].
+        Returns:
+            For the camera and the tiles None, because they are no tensors; then the gradients of
+            the three images that lie under the drawing; then, for each set of Gaussians, those of
+            its means, quats, scales, opacities and colors. A gradient that nobody asked for is
+            None.
         """
         drawing: Drawing = ctx.drawing
         fields = ctx.saved_tensors[IMAGES:]  # the first ones are the images of the result
@@ -152,10 +155,14 @@ class DrawFunction(torch.autograd.Function):
 def gradients_of_background(
     drawing: Drawing, image_gradients: Sequence[Tensor], needs: Sequence[bool]
 ) -> list[Tensor | None]:
-    """The gradients of the three images under the drawn tiles; None where not needed.
+    """The gradients of the three images over which the tiles were drawn; None where not needed.
 
-    A pixel over which a tile was drawn has none: its gradient is 0. `image_gradients` are those of
-    the result: rgb [H, W, 3], depth [H, W], alpha [H, W].
+    A pixel that a drawn tile covers does not show in the result, so its gradient is 0.
+
+    Args:
+        drawing: knows which tiles were drawn.
+        image_gradients: those of the result: rgb [H, W, 3], depth [H, W], alpha [H, W].
+        needs: [3] whether the gradient of each image is needed.
     """
     height, width = image_gradients[1].shape
     mask = tile_mask(torch.from_numpy(drawing.drawn_tiles), height, width)  # [H, W]
@@ -217,11 +224,18 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
 
 
 def gradients_of_set(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor]:
-    """The gradients of a set's means, quats, scales, opacities and colors.
+    """The gradients of a set's means, quats, scales, opacities and colors, from sums over pixels.
 
-    `fields` are these five tensors, and `table` [n, 10] has the sums over pixels of each Gaussian.
+    Args:
+        fields: these five tensors, of n Gaussians.
+        view: the camera.
+        table: [n, 10] sums over the pixels that each Gaussian covers. With a pixel's offset
+            (dx, dy) from the Gaussian's centre, u = dx - slope·dy (the distance from the place in
+            its row where alpha is largest) and v = ∂L/∂ln(alpha), they are the sums of v, v·u,
+            v·u², v·dy, v·dy², v·u·dy; then the gradients of red, green, blue and depth.
     """
     scene = tuple(as_array(field) for field in fields)
+    # Zero at first; `project_backward` writes those of the Gaussians `start` to `stop` - 1.
     gradients = tuple(np.zeros(field.shape, np.float32) for field in fields)
 
     parallel_for_chunks(

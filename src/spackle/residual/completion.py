@@ -32,12 +32,13 @@ MIN_AUX_GAUSSIANS = 64  # least number of aux Gaussians in a view (paper, "Train
 # Which cells of a view (2×2 pixels) get an aux Gaussian: "masked" are those in holes, the paper's
 # method; "all" is the dense grid of the paper's table of mask-guided initialisation.
 CellChoice = Literal["masked", "all"]
-MIN_RELATIVE_DEPTH = 1e-4  # smaller inverse depths, as fractions of the view's median, are raised
+MIN_RELATIVE_DEPTH = 1e-4  # inverse depths below this fraction of the view's median are raised
 
 
 class ViewCompletion:
-    """Fills the holes of one rendered view with aux Gaussians, step by step; each step runs when it
-    is asked for.
+    """Fills the holes of one rendered view with aux Gaussians, as the paper does (eqs. 2 to 7).
+
+    Each step runs when its result is asked for.
 
         view = ViewCompletion(renderer.render(base, camera), camera, photo_camera)
         deltas = view.deltas(network)                 # eq. 5
@@ -177,11 +178,15 @@ class ViewCompletion:
         raise ValueError(f"a network names the unknown input {name!r}")
 
     def _log_depth(self, inverse_depth: Tensor) -> Tensor:
-        """log(inverse depth / the view's median), of inverse depths [h, w]."""
-        return (inverse_depth / self.initial.unit).clamp_min(MIN_RELATIVE_DEPTH).log()
+        """[h, w] log(inverse depth / the view's median inverse depth), of inverse depths [h, w]."""
+        median = self.initial.unit
+        return (inverse_depth / median).clamp_min(MIN_RELATIVE_DEPTH).log()
 
     def network_input(self, names: Sequence[str]) -> Tensor:
-        """[1, C, h, w] float32, without gradients: the named inputs, one after the other."""
+        """[1, C, h, w] float32, without gradients: the channels of the named inputs in a row.
+
+        `names` are those of `INPUT_CHANNELS`, which also says how many channels each has.
+        """
         channels = torch.cat([self.input(name) for name in names], dim=-1)  # [h, w, C]
         return channels.permute(2, 0, 1)[None].detach()
 
@@ -192,13 +197,15 @@ class ViewCompletion:
         *,
         cells: Tensor | None = None,
     ) -> Tensor | None:
-        """The network's changes [h, w, 14] of the initial Gaussians (eq. 5), float32.
+        """[h, w, 14] float32: the network's changes of the initial Gaussians (the paper's eq. 5).
 
-        The initial Gaussians are the first guess of what fills each cell of 2×2 pixels. Without a
-        network the result is None.
+        The initial Gaussians are the first guess of what fills each cell of 2×2 pixels. The 14
+        changes of each are those of its place in the picture (2), inverse depth (1), scales (3),
+        quaternion (4), colour (3) and opacity (1). Without a network the result is None.
 
         Args:
-            network: f_res, on any device.
+            network: the residual network (f_res in the paper), on any device. Its `inputs` are
+                names such as "rgb" or "mask", see `input`.
             precision: of its convolutions; auto is bfloat16 if the hardware multiplies it natively.
             cells: [h, w] bool: the cells that need deltas, all others get zeros; None: those with
                 at least one hole pixel.
@@ -207,10 +214,13 @@ class ViewCompletion:
             return None
         if cells is None:
             cells = self.mask
-        return predict_deltas(network, self.network_input(network.inputs), cells, precision)
+        channels = self.network_input(network.inputs)  # [1, C, h, w]
+        return predict_deltas(network, channels, cells, precision)
 
     def gaussians(self, cells: Tensor, deltas: Tensor | None) -> Gaussians:
-        """One Gaussian for each of n cells of 2×2 pixels (eq. 7); gradients reach the deltas.
+        """One Gaussian for each of n cells of 2×2 pixels (the paper's eq. 7).
+
+        Gradients reach the deltas.
 
         Args:
             cells: which cells, as a boolean grid [h, w] or row-major indices [n].
@@ -228,10 +238,10 @@ class ViewCompletion:
 
 
 def moved(value: T, device: torch.device) -> T:
-    """A view's completion, or anything that holds tensors, on another device with all that was
-    computed so far.
+    """The same value with all its tensors on another device; cameras stay on the CPU.
 
-    Cameras stay on the CPU. A value that is there already is returned as it is.
+    A view's completion takes along what it has computed so far. A value that is on the device
+    already is returned as it is.
 
     Args:
         value: a tensor, a completion, a dataclass or dictionary with any of these; anything else is

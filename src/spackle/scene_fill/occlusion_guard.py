@@ -29,8 +29,8 @@ WINDOW_RADIUS_PX = 4  # of the guard's windows: most new Gaussians reach no fart
 # A Gaussian is visible up to so many standard deviations from its centre: exp(-x² / 2) = ALPHA_MIN.
 VISIBLE_SIGMAS = math.sqrt(-2 * math.log(ALPHA_MIN))
 MAX_REACH_PX = 40.0  # a Gaussian is checked only up to this distance from its centre
-# A near spot in the depths of a hole is removed if it is less than twice as wide, as a fraction of
-# the view's width.
+# A near spot in the depths of a hole is removed if it is less than twice this wide. The radius is a
+# fraction of the view's width.
 PIT_RADIUS_WIDTHS = 0.027
 # Where the rows of the extrinsics for x and y begin in a camera's 16 numbers: fx, fy, cx, cy, and
 # the 3×4 extrinsics row by row.
@@ -68,9 +68,9 @@ class OcclusionGuard:
         is_hole = view.alpha < threshold
         surface_depth = torch.where(is_hole, 0, view.depth).float()
         if keep_empty is not None:
-            # Empty space is like a surface at infinity: everything would hide it. Not so at its
-            # border: the filter below would carry this infinite depth onto the surfaces beside it,
-            # so a strip of twice the filter's radius is left as it is.
+            # Empty space is like a surface at infinity: everything would hide it. Its border is
+            # left out, a strip of twice the filter's radius, because the filter below would carry
+            # the infinite depth onto the surfaces beside it.
             is_shown = ~keep_empty.to(view.alpha.device)
             is_beside_space = maximum_filter(is_shown, 2 * WINDOW_RADIUS_PX)
             surface_depth = torch.where(is_beside_space, surface_depth, torch.inf)
@@ -114,9 +114,10 @@ def move_from_eye(gaussians: Gaussians, eye: Tensor, scales: Tensor) -> Gaussian
 def unoccluding_scales(
     gaussians: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
 ) -> Tensor:
-    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface.
+    """[N] factors by which Gaussians must move away from an eye to hide no guarded surface.
 
-    The factor is 0 if a Gaussian hides a surface wherever it moves.
+    The factor multiplies a Gaussian's distance from the eye. It is at least 1 (1: it need not
+    move), or else 0, for a Gaussian that hides a surface wherever it moves.
 
     Args:
         gaussians: N Gaussians in the world's frame.
@@ -139,9 +140,10 @@ def unoccluding_scales(
         sizes=sizes.to(device),
         starts=(ends - sizes.prod(dim=1)).to(device),
     )
-    scales = torch.empty(len(rays), dtype=torch.float64, device=device)
     eye_position = Point(*eye.detach().double().tolist())
-    _find_scale(
+    # The kernel runs for each of the N Gaussians, and writes its factor into `scales`.
+    scales = torch.empty(len(rays), dtype=torch.float64, device=device)
+    _write_scale(
         len(rays), eye_position, rays.contiguous(), covariances.contiguous(), surfaces, scales
     )
     return scales.to(gaussians.means.dtype)
@@ -173,8 +175,9 @@ def _camera_numbers(camera: Camera) -> Tensor:
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
-    """Depths [n] of n cells, in which narrow parts that are nearer than what surrounds them have
-    moved to the depth around them (a morphological closing).
+    """[n] depths of cells, without narrow parts that are nearer than what surrounds them.
+
+    Such parts get the depth around them (a morphological closing).
 
     Args:
         depths: [n] z of the cells.
@@ -193,19 +196,19 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
 
 
 @kernel_for_items
-def _find_scale(n: int, eye: Any, rays: Any, covariances: Any, surfaces: Any, scales: Any) -> None:
-    """For a Gaussian, write the least of 48 factors by which it must move away from an eye to hide
-    no guarded surface; 0 if it hides one at all of them.
+def _write_scale(n: int, eye: Any, rays: Any, covariances: Any, surfaces: Any, scales: Any) -> None:
+    """Write the least of 48 factors with which one Gaussian hides no guarded surface, or 0.
 
-    The factors are 1 / (1 − step / 48), for step = 0 … 47.
+    A factor multiplies the Gaussian's distance from the eye. The factors are 1 / (1 − step / 48),
+    for step = 0 … 47. 0 means that the Gaussian hides a surface with all of them.
 
     Args:
-        n: number of the Gaussian.
+        n: index of the Gaussian; the kernel runs for each index.
         eye: the point from which the Gaussians move away.
         rays: [N, 3] from the eye to the Gaussians' centres.
         covariances: [N, 9] in the world's frame.
         surfaces: `GuardedSurfaces`.
-        scales: output [N].
+        scales: output [N]; scales[n] is written.
     """
     scales[n] = 0
     for step in range(DEPTH_STEPS):
@@ -260,8 +263,8 @@ def _hides_surface(
         return False
 
     # Each depth of the guard is the greatest within a window around its pixel. So not every pixel
-    # that the Gaussian covers has to be looked at: pixels one window apart see all of it.
-    # On a GPU, `ceil` and `floor` give floats.
+    # that the Gaussian covers has to be looked at: pixels one window apart see all of it. On a GPU,
+    # `ceil` and `floor` give floats, hence np.int64.
     spacing_px = 2 * WINDOW_RADIUS_PX
     steps_u = np.int64(math.ceil(max(reach_u - WINDOW_RADIUS_PX, 0.0) / spacing_px))
     steps_v = np.int64(math.ceil(max(reach_v - WINDOW_RADIUS_PX, 0.0) / spacing_px))

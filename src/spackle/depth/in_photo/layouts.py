@@ -80,8 +80,8 @@ class CodedDepth:
     codes: Array  # [H, W] whole numbers
     max_code: int  # the highest code of the picture's format
     scale: CodeScale
-    # What makes the codes upright, from left to right: "t" swaps rows and columns, "x" left and
-    # right, "y" top and bottom.
+    # The steps that make the codes upright, one letter each, in this order: "t" swaps rows and
+    # columns, "x" left and right, "y" top and bottom.
     upright_steps: str = ""
 
     def decode(self) -> tuple[Array, float]:
@@ -108,7 +108,7 @@ class CodedDepth:
             return 1 / np.maximum(values, abs(slope) / 2), step
 
     def upright(self, stored: Tensor) -> Tensor:
-        """A map [H, W] in the orientation of the codes, turned as the photo is shown."""
+        """A map [H, W] that lies as the codes do, turned so that it is upright like the photo."""
         # Axis 1 runs from left to right, axis 0 from top to bottom.
         for step in self.upright_steps:
             stored = stored.T if step == "t" else stored.flip(1 if step == "x" else 0)
@@ -190,7 +190,7 @@ def _factor_to_plausible(depth: Tensor) -> float:
 
 
 def _read_codes(picture: bytes) -> tuple[Array, int]:
-    """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
+    """The values [H, W] of a JPEG or PNG, and the highest value that its pixels can have."""
     with open_image(io.BytesIO(picture), ("JPEG", "PNG")) as image:
         width, height = image.size
         check_pixel_count(width, height, len(picture), "the map")
@@ -466,22 +466,38 @@ HEVC_UNEVEN_DISPARITY = 3
 def hevc_scale(stated: dict[str, Any]) -> CodeScale:
     """What the codes of a HEIF's depth map mean, by HEVC's "depth representation information".
 
-    `stated` is that information; without it, the usual range of 1 to 10 m is assumed. ValueError
-    for a range that is impossible, or disparities that are not linear in the codes.
+    Args:
+        stated: that information: "representation_type", which says what is linear in the codes;
+            and the range, which is "d_min" and "d_max" for disparities, else "z_near" and "z_far"
+            in metres. Without a range, the usual one of 1 to 10 m is assumed.
+
+    Raises:
+        ValueError: the range is impossible, or the codes are not linear in a disparity or depth.
     """
     representation = stated.get("representation_type")
     if representation == HEVC_UNEVEN_DISPARITY:
         raise ValueError("disparities with steps of uneven size are not read")
-    is_disparity = representation == HEVC_DISPARITY
-    first = stated.get("d_min" if is_disparity else "z_near")
-    last = stated.get("d_max" if is_disparity else "z_far")
-    if first is None or last is None:
+    if representation == HEVC_DISPARITY:
+        least = stated.get("d_min")
+        greatest = stated.get("d_max")
+        if least is None or greatest is None:
+            return ASSUMED_SCALE
+        if not least < greatest:
+            raise ValueError(f"nothing can lie between disparity {least:g} and {greatest:g}")
+        scale = CodeScale("disparity", least, greatest, "HEIF disparity")
+        scale.check()
+        return scale
+
+    near = stated.get("z_near")
+    far = stated.get("z_far")
+    if near is None or far is None:
         return ASSUMED_SCALE
-    if is_disparity:
-        return CodeScale("disparity", first, last, "HEIF disparity")
-    if not 0 < first < last:
-        raise ValueError(f"nothing can lie between near {first:g} and far {last:g}")
+    if not 0 < near < far:
+        raise ValueError(f"nothing can lie between near {near:g} and far {far:g}")
     if representation == HEVC_DEPTH:
-        return CodeScale("depth", first, last, "HEIF depth")
-    # Else the inverse depth is linear in the codes, and its range is stated as near and far depth.
-    return CodeScale("disparity", 1 / last, 1 / first, "HEIF inverse depth")
+        scale = CodeScale("depth", near, far, "HEIF depth")
+    else:
+        # The inverse depth is linear in the codes: code 0 means the farthest depth.
+        scale = CodeScale("disparity", 1 / far, 1 / near, "HEIF inverse depth")
+    scale.check()
+    return scale
