@@ -23,7 +23,8 @@ from worlds.shell import material_of
 from worlds.viewpoints import Viewpoint
 
 Rng = np.random.Generator
-BEGIN = -8.0  # y of the ends of hedges and fences behind the camera
+BORDERS_BEGIN = -8.0  # y of the ends of hedges and fences behind the camera, in metres
+HOUSE_DEPTH_M = 9.0
 TERRACE_M = 0.07  # height of a terrace above the lawn
 # Models' names, separated by spaces, as `Scene.find` takes them.
 LARGE = (
@@ -58,31 +59,35 @@ def garden(rng: Rng, library: Library, cache: Path) -> WorldPlan:
     trees = TREES_OF_CLIMATES[int(rng.integers(len(TREES_OF_CLIMATES)))]
     lawn = scene.surface("grass")
     half_width = width / 2
-    # Grass to the horizon.
+    # Grass to the horizon: a square of 800 m around the camera's place.
     lawn_tile = (lawn.tile_m, lawn.tile_m)
     scene.parts.append(
         quad((-400, -400, KERB_M), (800, 0, 0), (0, 800, 0), material_of(lawn), lawn_tile)
     )
 
-    # The house, 9 m deep, somewhere at the garden's far end, and its neighbours at both sides.
+    # The house, somewhere at the garden's far end, and its neighbours at both sides.
     style = choose_style(rng, scene.surface)
     house_width = min(width - 1, rng.uniform(8, 13))
     most_shift = (width - house_width) / 2
     house_x = rng.uniform(-most_shift, most_shift)  # its middle
     roof = roof_kind(rng, town=False)
-    own_house = house(rng, scene.surface, style, house_width, 9, int(rng.integers(1, 3)), roof)
+    floors = int(rng.integers(1, 3))
+    own_house = house(rng, scene.surface, style, house_width, HOUSE_DEPTH_M, floors, roof)
     # A house looks towards −y as it is made, which is towards the garden.
-    scene.parts.append(own_house.moved(np.eye(3), (house_x - house_width / 2, depth, KERB_M)))
-    scene.taken.append(Box(-half_width, depth - 0.2, half_width, depth + 12, 0, 12))
+    not_turned = np.eye(3)
+    scene.parts.append(own_house.moved(not_turned, (house_x - house_width / 2, depth, KERB_M)))
+    scene.taken.append(Box(-half_width, depth - 0.2, half_width, depth + 12, z0=0, z1=12))
     for side in (-1, 1):
         neighbour_style = choose_style(rng, scene.surface)
         neighbour_width = rng.uniform(8, 12)
         floors = int(rng.integers(1, 3))
-        neighbour = house(rng, scene.surface, neighbour_style, neighbour_width, 9, floors, roof)
+        neighbour = house(
+            rng, scene.surface, neighbour_style, neighbour_width, HOUSE_DEPTH_M, floors, roof
+        )
         # Its left end: 3 m beyond the border, or so that the widest ends 2 m before the border.
         left = half_width + 3 if side > 0 else -half_width - 14
         y = depth + rng.uniform(-3, 5)
-        scene.parts.append(neighbour.moved(np.eye(3), (left, y, KERB_M)))
+        scene.parts.append(neighbour.moved(not_turned, (left, y, KERB_M)))
 
     # A terrace before the house, which reaches 10 cm into the ground.
     slabs = scene.surface("paving", "planks", "tiles")
@@ -104,12 +109,14 @@ def garden(rng: Rng, library: Library, cache: Path) -> WorldPlan:
     for _ in range(6):  # trees beyond the borders, behind the house's front
         x = rng.choice([-1, 1]) * rng.uniform(half_width + 4, half_width + 25)
         plant(scene, trees, x, depth + rng.uniform(5, 40))
-    for names, count in ((LARGE, int(rng.integers(0, 3))), (SMALL, int(rng.integers(2, 7)))):
+    large_count = int(rng.integers(0, 3))
+    small_count = int(rng.integers(2, 7))
+    for names, count in ((LARGE, large_count), (SMALL, small_count)):
         for _ in range(count):
             x = rng.uniform(-half_width + 1.5, half_width - 1.5)
             y = rng.uniform(2.5, terrace_begin - 1)
             scene.put(scene.find(names), x, y, KERB_M, rng.uniform(0, 360), margin=0.2)
-    for _ in range(int(rng.integers(0, 4))):
+    for _ in range(int(rng.integers(0, 4))):  # people and animals
         x = rng.uniform(-half_width + 1.5, half_width - 1.5)
         y = rng.uniform(2.5, depth - 0.6)
         scene.put(scene.find(PEOPLE + " dog cat"), x, y, KERB_M, rng.uniform(0, 360))
@@ -131,12 +138,14 @@ def garden(rng: Rng, library: Library, cache: Path) -> WorldPlan:
         lights=daylight(rng),
         draw_viewpoint=draw_viewpoint,
         models=tuple(sorted(scene.used)),
-        coarse_m=0.6,
+        coarse_m=0.6,  # width of the coarse cells of light; gardens are smaller than streets
     )
 
 
 def _add_borders(scene: Scene, half_width: float, depth: float) -> None:
-    """Add a hedge or a fence at the left and at the right side of a garden.
+    """Add a hedge or a fence at the left and at the right side of a garden, and take their places.
+
+    Both begin behind the camera, at y = BORDERS_BEGIN.
 
     Args:
         scene: gets them.
@@ -144,17 +153,20 @@ def _add_borders(scene: Scene, half_width: float, depth: float) -> None:
         depth: metres; they end at y = `depth`, at the house.
     """
     rng = scene.rng
-    # The ends of each are in this order so that a fence has its rails and posts outside.
-    left = ((-half_width, BEGIN), (-half_width, depth))
-    right = ((half_width, depth), (half_width, BEGIN))
+    # The ends (x, y) of each. A fence has its rails and posts to the left of the way from the first
+    # to the second, so in this order they are outside of the garden.
+    left = ((-half_width, BORDERS_BEGIN), (-half_width, depth))
+    right = ((half_width, depth), (half_width, BORDERS_BEGIN))
     for start, end in (left, right):
         x = start[0]
         if rng.random() < 0.5:
-            height = rng.uniform(1.0, 2.1)
-            hedge(scene, (x - 0.35, BEGIN, KERB_M), (x + 0.35, depth, KERB_M + height))
+            top = KERB_M + rng.uniform(1.0, 2.1)
+            # `hedge` also adds its box to `scene.taken`; `fence` does not.
+            hedge(scene, (x - 0.35, BORDERS_BEGIN, KERB_M), (x + 0.35, depth, top))
         else:
-            fence(scene, start, end, rng.uniform(0.9, 1.9), near_camera=True)
-            scene.taken.append(Box(x - 0.2, BEGIN, x + 0.2, depth, 0, 2))
+            height = rng.uniform(0.9, 1.9)
+            fence(scene, start, end, height, near_camera=True)
+            scene.taken.append(Box(x - 0.2, BORDERS_BEGIN, x + 0.2, depth, z0=0, z1=2))
 
 
 def _add_flower_bed(scene: Scene, side: int, half_width: float, depth: float) -> None:
@@ -192,7 +204,8 @@ def _furnish_terrace(scene: Scene, left: float, right: float, begin: float, end:
     """
     rng = scene.rng
     floor = KERB_M + TERRACE_M
-    x, y = (left + right) / 2 + rng.normal(0, 0.5), (begin + end) / 2
+    x = (left + right) / 2 + rng.normal(0, 0.5)
+    y = (begin + end) / 2
     if rng.random() < 0.6:
         _add_table(scene, x, y, floor)
     else:

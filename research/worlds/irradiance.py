@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,19 +23,20 @@ Longs = NDArray[np.int64]
 BASE_CELL_M = 0.01  # width of cells at level 0; each level doubles it
 CELL_PX = 5.0  # width of a cell in the photo
 MAX_LEVEL = 9  # cells of 5 m
-COARSE_LEVEL = 20  # a name for the coarse cells, which have one width everywhere
+# Coarse cells all have one width. Their level is this number, which no fine cell has.
+COARSE_LEVEL = 20
 GATHER_RAYS = 32  # of a fine cell
 COARSE_RAYS = 24  # of a coarse cell
 PORTAL_RAYS = 16  # of a cell towards the windows
 LAMP_RAYS = 4  # of a cell towards each lamp
 BOUNCES = 6  # how often light goes from coarse cells to coarse cells
 COARSE_SAMPLES = 12  # places at which sunlight is looked for, for each coarse cell on average
-EMPTY = -1
+EMPTY = -1  # a free place of a hash table, and the number of "no cell"
 MAX_RAY_RATIO = 4.0  # a ray may be this many times as bright as the mean of its cell
 # How the light of cells is smoothed against noise: rounds of (distance to the neighbours in cells,
-# share by which their light may differ before they count less). Noise of gathered light is about a
-# fifth, and it varies slowly; that of direct light is less. The first round takes any neighbour, so
-# that single outliers vanish.
+# share by which their light may differ before they count less). Gathered light has noise of about a
+# fifth, and varies slowly, so it gets more rounds and farther neighbours; direct light has less
+# noise. The first round takes neighbours of any light, so that single outliers vanish.
 ANY = 1e3
 GATHERED_ROUNDS = ((1, ANY), (2, 0.6), (3, 0.5), (1, 0.5))
 DIRECT_ROUNDS = ((1, ANY), (2, 0.4), (1, 0.4))
@@ -45,16 +45,16 @@ CHUNK = 400_000  # rays at once
 
 @dataclasses.dataclass(frozen=True)
 class Cells:
-    """Cubes in which surfaces lie, in a hash table, and a point of a surface for each.
+    """C cubes in which surfaces lie, in a hash table, and a point of a surface for each.
 
-    A cell is one level (its width), one place and one of six sides, so that the two sides of a thin
-    wall are two cells.
+    A cell has a level, which tells its width, a place, and the one of six directions (±x, ±y, ±z)
+    that the surface's normal is nearest to. So the two sides of a thin wall are two cells.
     """
 
-    table: Longs  # [2^k] keys of cells by their hash, EMPTY where free; see `_key`
-    slots: Longs  # [2^k] the number of the cell with this key
+    table: Longs  # [2^k] keys of cells at places by their hash, EMPTY where free; see `_key`
+    slots: Longs  # [2^k] the number, 0 to C - 1, of the cell whose key stands at this place
     position: Floats  # [C, 3] a point of a surface in the cell
-    normal: Floats  # [C, 3]
+    normal: Floats  # [C, 3] the surface's unit normal there
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,14 +71,14 @@ class _RayEnds:
 class Irradiance:
     """Light on the surfaces of a world, without direct sunlight."""
 
-    cells: Cells
-    light: Floats  # [C, 3] irradiance
-    coarse: Cells
+    cells: Cells  # C fine ones
+    light: Floats  # [C, 3] irradiance of the fine cells
+    coarse: Cells  # D coarse ones
     coarse_light: Floats  # [D, 3] irradiance, with sunlight
-    coarse_m: float
-    eye: Floats  # [3] the photo's camera, around which cells grow
-    angle: float  # width of a cell over its distance from the eye
-    mean: Floats  # [3] where no cell is known
+    coarse_m: float  # width of coarse cells in metres
+    eye: Floats  # [3] the photo's camera; fine cells are wider the farther they are from it
+    angle: float  # width of a fine cell over its distance from the eye
+    mean: Floats  # [3] the mean of `light`, which stands where no cell is known
 
     def at(self, positions: Floats, normals: Floats) -> Floats:
         """[N, 3] irradiance at points [N, 3] with unit normals [N, 3]."""
@@ -120,8 +120,9 @@ class Irradiance:
 
 
 def cell_levels(positions: Floats, eye: Floats, angle: float) -> Floats:
-    """[N] levels of cells at points [N, 3], as fractions, so that cells are equally wide seen
-    from the eye.
+    """[N] levels of cells at points [N, 3], with which cells look equally wide from the eye.
+
+    They are no whole numbers. `eye` is [3]; `angle` is a cell's width over its distance from it.
     """
     distance = np.linalg.norm(positions - eye, axis=1)
     levels = np.log2(np.maximum(distance * angle / BASE_CELL_M, 1e-6))
@@ -145,7 +146,7 @@ def solve(
 
     Args:
         world, lights: the world.
-        rng: directions of rays.
+        rng: for the directions of rays.
         positions, normals: [N, 3] points that the views see, and their unit normals.
         eye: [3] the photo's camera.
         focal_px: the photo's focal length.
@@ -155,7 +156,7 @@ def solve(
     levels = cell_levels(positions, eye, angle)
     cells = _cells(positions, normals, levels, BASE_CELL_M, both_levels=True)
 
-    # Where the rays of fine cells end, there coarse cells are needed.
+    # Coarse cells are needed where rays of fine cells end.
     ends = _gather(world, rng, cells.position, cells.normal, GATHER_RAYS)
     coarse_base_m = coarse_m / 2.0**COARSE_LEVEL  # the level then makes cells `coarse_m` wide
     coarse_levels = np.full(len(ends.positions), COARSE_LEVEL, np.float32)
@@ -205,9 +206,10 @@ def _bounced(
 
     Args:
         world, lights: the world.
-        rng: directions of rays.
+        rng: for the directions of rays.
         coarse: the C cells.
-        base_m: width of cells at level 0, see `_find`.
+        base_m: width in metres that cells of level 0 would have; those of COARSE_LEVEL, which all
+            are, are 2^COARSE_LEVEL times as wide.
         albedo: [C, 3] share of light that they reflect.
         direct: [C, 3] irradiance from windows, lamps and the sun.
     """
@@ -216,8 +218,8 @@ def _bounced(
     cell_of_ray = np.full(len(ends.missed), EMPTY, np.int64)
     cell_of_ray[~ends.missed] = _find(coarse, ends.positions, ends.normals, base_m)
     table = cell_of_ray.reshape(-1, COARSE_RAYS)  # [C, R] the cell that each ray meets
-    # Surfaces that no view's rays have met have no cell. They shine as the mean of all cells, which
-    # is the last row of `reflected`.
+    # Surfaces that no view's rays have met have no cell. They shine as the mean of all cells, whose
+    # number is C: the last row of `reflected`.
     table = np.where(table >= 0, table, len(coarse.position))
 
     sky = _sky_light(lights, coarse.normal, ends.missed, COARSE_RAYS)
@@ -259,8 +261,8 @@ def _cells(
         both_levels: whether each point gets a cell of the next level, too, because light is
             interpolated between the two.
     """
-    # A power of two, at least 1.6 times as large as the number of points, so that hashes seldom
-    # meet.
+    # A power of two, at least 1.6 times as large as the number of points, so that two cells seldom
+    # have the same place.
     room = 1 << max(10, int(len(positions) * 1.6).bit_length())
     table = np.full(room, EMPTY, np.int64)
     slots = np.zeros(room, np.int64)
@@ -273,7 +275,13 @@ def _cells(
 
 
 def _find(cells: Cells, positions: Floats, normals: Floats, base_m: float) -> Longs:
-    """[N] the numbers of the coarse cells in which points lie; EMPTY for none."""
+    """[N] the numbers of the coarse cells in which points lie; EMPTY for none.
+
+    Args:
+        cells: the coarse cells.
+        positions, normals: [N, 3] the points, and their unit normals.
+        base_m: width in metres of a coarse cell, divided by 2^COARSE_LEVEL.
+    """
     result = np.zeros(len(positions), np.int64)
     _lookup(cells.table, cells.slots, positions, normals, np.float32(base_m), result)
     return result
@@ -406,11 +414,12 @@ def _from_portals(
         if not len(facing):
             continue
 
-        # [F, parts, 3] the points of the window, and the ways to them.
-        cells = grid * grid
-        place = np.arange(cells)
-        a = (place % grid + rng.random((len(facing), cells))) / grid
-        b = (place // grid + rng.random((len(facing), cells))) / grid
+        # For each of F points, a place in each part of the window: shares of its two sides.
+        parts = grid * grid
+        number = np.arange(parts)
+        a = (number % grid + rng.random((len(facing), parts))) / grid
+        b = (number // grid + rng.random((len(facing), parts))) / grid
+        # [F, parts, 3] these places, and the ways to them.
         targets = corner + a[..., None] * side + b[..., None] * other
         ways = (targets - positions[facing, None]).astype(np.float32)
         distance = np.linalg.norm(ways, axis=-1)
@@ -419,7 +428,7 @@ def _from_portals(
         other_cosine = -(directions @ area_normal.astype(np.float32))
         use = (cosine > 0) & (other_cosine > 0)
 
-        # Which ways are open.
+        # Which ways are open. Rays begin a little in front of the surface.
         origins = np.broadcast_to(
             (positions[facing] + NUDGE_M * 4 * normals[facing])[:, None], ways.shape
         )
@@ -427,7 +436,7 @@ def _from_portals(
         # A curtain outside of the window's plane blocks as well, so the ray goes on a little.
         open_way[use] = ~world.blocked(origins[use], directions[use], distance[use] + 0.3)
         # Nearer than 5 cm, the sum would be grainy.
-        weight = cosine * other_cosine * area / np.maximum(distance, 0.05) ** 2 / cells
+        weight = cosine * other_cosine * area / np.maximum(distance, 0.05) ** 2 / parts
         weight = np.where(open_way, weight, 0.0)
         radiance = lights.sky_radiance(directions.reshape(-1, 3)).reshape(*use.shape, 3)
         total[facing] += (weight[..., None] * radiance).sum(1).astype(np.float32)
@@ -533,11 +542,11 @@ def _sky_light(lights: Lights, normals: Floats, missed: NDArray[np.bool_], rays:
     """
     if len(lights.portals):
         return np.zeros((len(normals), 3), np.float32)
-    # The mean of the sky's upper half. It is darker for walls, which see land as well.
-    openness = missed.reshape(-1, rays).mean(1)
-    above = lights.sky[: lights.sky.shape[0] // 2].mean((0, 1))
-    side = 0.6 + 0.4 * np.maximum(normals[:, 2], 0)
-    return np.asarray(math.pi * (openness * side)[:, None] * above, np.float32)
+    openness = missed.reshape(-1, rays).mean(1)  # [N] share of each point's rays
+    upper_half = lights.sky[: lights.sky.shape[0] // 2].mean((0, 1))  # [3] its mean radiance
+    # Walls see land as well, which is darker: they get 60 %.
+    sky_share = 0.6 + 0.4 * np.maximum(normals[:, 2], 0)
+    return np.asarray(math.pi * (openness * sky_share)[:, None] * upper_half, np.float32)
 
 
 def _smoothed(cells: Cells, light: Floats, rounds: tuple[tuple[int, float], ...]) -> Floats:
@@ -569,7 +578,15 @@ HASH_FACTOR = 0x1E3779B97F4A7C15  # odd, with irregular bits: near keys get far 
 
 @kernel
 def _key(level: int, x: int, y: int, z: int, side: int) -> int:
-    """One number for a cell: its level, place (18 bits a coordinate) and side (the last 3 bits)."""
+    """One number for a cell.
+
+    Its bits are the level, three coordinates (18 bits each), and the side (the last 3 bits).
+
+    Args:
+        level: of the cell.
+        x, y, z: its place, in widths of a cell.
+        side: the direction that the surface's normal is nearest to, see `_side_of_normal`.
+    """
     key = (level << COORDINATE_BITS) | (x + OFFSET)
     key = (key << COORDINATE_BITS) | (y + OFFSET)
     key = (key << COORDINATE_BITS) | (z + OFFSET)
@@ -577,8 +594,8 @@ def _key(level: int, x: int, y: int, z: int, side: int) -> int:
 
 
 @kernel
-def _side(x: float, y: float, z: float) -> int:
-    """Which of six directions a normal is nearest to."""
+def _side_of_normal(x: float, y: float, z: float) -> int:
+    """Which of six directions a normal is nearest to: 0 to 5 stand for +x, −x, +y, −y, +z, −z."""
     a = abs(x)
     b = abs(y)
     c = abs(z)
@@ -590,72 +607,86 @@ def _side(x: float, y: float, z: float) -> int:
 
 
 @kernel
-def _slot(table: Any, key: int) -> Any:
-    """The place of a key in the hash table, or the free place where it belongs."""
+def _place_of_key(table: Longs, key: int) -> int:
+    """The place of a key in a hash table `table` [2^k], or the free place where it belongs."""
     mask = table.shape[0] - 1
     mixed = key * HASH_FACTOR
     place = (mixed >> 20) & mask  # the upper bits are mixed best
     # Where another key stands already, the next place is taken.
-    while table[place] != -1 and table[place] != key:
+    while table[place] != EMPTY and table[place] != key:
         place = (place + 1) & mask
     return place
 
 
 @kernel
 def _insert(
-    table: Any,
-    slots: Any,
-    best: Any,
-    chosen: Any,
-    positions: Any,
-    normals: Any,
-    levels: Any,
+    table: Longs,
+    slots: Longs,
+    best: Floats,
+    chosen: Longs,
+    positions: Floats,
+    normals: Floats,
+    levels: Floats,
     base: float,
     both_levels: bool,
 ) -> int:
-    """Fill the table with the cells of points; returns the number of cells.
+    """Fill a hash table with the cells in which points lie; returns the number C of cells.
+
+    A cell is a cube of one level, with one of six directions of the surface in it (see `Cells`).
+    Cells are numbered from 0 in the order in which points need them. The point that is nearest to a
+    cell's middle stands for the cell.
 
     Args:
-        table, slots: outputs, see `Cells`.
-        best: [cells] becomes the squared distance of the nearest point to the cell's middle, in
-            cells; infinite at first.
-        chosen: [cells] becomes the index of this point.
+        table: [2^k] output: keys of cells; EMPTY (−1) at first.
+        slots: [2^k] output: the number of the cell whose key stands at this place of `table`.
+        best: [2^k] output, by cell number: the squared distance of the nearest point to the cell's
+            middle, in widths of the cell; infinite at first.
+        chosen: [2^k] output, by cell number: the index of that point.
         positions, normals: [N, 3] the points, and their unit normals.
-        levels: [N] of the points' cells.
-        base: width of a cell at level 0.
+        levels: [N] the level of the cell in which each point lies; fractions are cut off.
+        base: width of a cell at level 0; each level doubles it.
         both_levels: whether each point also gets a cell of the next level.
     """
     count = 0
     for n in range(positions.shape[0]):
         low = int(levels[n])
-        side = _side(normals[n, 0], normals[n, 1], normals[n, 2])
+        side = _side_of_normal(normals[n, 0], normals[n, 1], normals[n, 2])
         for step in range(2 if both_levels else 1):
             size = base * 2.0 ** (low + step)
             x = np.floor(positions[n, 0] / size)
             y = np.floor(positions[n, 1] / size)
             z = np.floor(positions[n, 2] / size)
             key = _key(low + step, int(x), int(y), int(z), side)
-            place = _slot(table, key)
-            if table[place] == -1:
+            place = _place_of_key(table, key)
+            if table[place] == EMPTY:
                 table[place] = key
                 slots[place] = count
                 count += 1
 
-            # The point nearest the middle stands for the cell.
+            # From the cell's middle to the point, in widths of the cell.
             cell = slots[place]
             dx = positions[n, 0] / size - x - 0.5
             dy = positions[n, 1] / size - y - 0.5
             dz = positions[n, 2] / size - z - 0.5
-            away = dx * dx + dy * dy + dz * dz
-            if away < best[cell]:
-                best[cell] = away
+            squared_distance = dx * dx + dy * dy + dz * dz
+            if squared_distance < best[cell]:
+                best[cell] = squared_distance
                 chosen[cell] = n
     return count
 
 
 @kernel
-def _lookup(table: Any, slots: Any, positions: Any, normals: Any, base: float, result: Any) -> None:
-    """Write the numbers of coarse cells in which points lie; −1 for none."""
+def _lookup(
+    table: Longs, slots: Longs, positions: Floats, normals: Floats, base: float, result: Longs
+) -> None:
+    """Write the numbers of coarse cells in which points lie; EMPTY (−1) for none.
+
+    Args:
+        table, slots: [2^k] the hash table of the cells, see `Cells`.
+        positions, normals: [N, 3] the points, and their unit normals.
+        base: width of a coarse cell, divided by 2^COARSE_LEVEL.
+        result: [N] output.
+    """
     size = base * 2.0**COARSE_LEVEL
     for n in range(positions.shape[0]):
         key = _key(
@@ -663,43 +694,45 @@ def _lookup(table: Any, slots: Any, positions: Any, normals: Any, base: float, r
             int(np.floor(positions[n, 0] / size)),
             int(np.floor(positions[n, 1] / size)),
             int(np.floor(positions[n, 2] / size)),
-            _side(normals[n, 0], normals[n, 1], normals[n, 2]),
+            _side_of_normal(normals[n, 0], normals[n, 1], normals[n, 2]),
         )
-        place = _slot(table, key)
-        result[n] = slots[place] if table[place] == key else -1
+        place = _place_of_key(table, key)
+        result[n] = slots[place] if table[place] == key else EMPTY
 
 
 @kernel
 def _interpolate(
-    table: Any,
-    slots: Any,
-    cell_position: Any,
-    cell_normal: Any,
-    light: Any,
-    positions: Any,
-    normals: Any,
-    levels: Any,
+    table: Longs,
+    slots: Longs,
+    cell_position: Floats,
+    cell_normal: Floats,
+    light: Floats,
+    positions: Floats,
+    normals: Floats,
+    levels: Floats,
     base: float,
-    fallback: Any,
-    result: Any,
+    fallback: Floats,
+    result: Floats,
 ) -> None:
-    """Write the light at points: a mean over the eight nearest cells of two levels.
+    """Write the light at points: a mean over the eight nearest cells of each of two levels.
 
-    Cells count by their distance, by how far their surface's plane is from the point, and by
-    the angle between the normals.
+    Coarse cells have only one level. Cells count less the farther they are, the farther their point
+    is from the plane through the given point, and the more the normals differ.
 
     Args:
-        table, slots, cell_position, cell_normal: the cells, see `Cells`.
-        light: [C, 3] of the cells.
+        table, slots: [2^k] the hash table of C cells, see `Cells`.
+        cell_position, cell_normal: [C, 3] a point of a surface in each cell, and its unit normal.
+        light: [C, 3] irradiance of the cells.
         positions, normals: [N, 3] the points, and their unit normals.
-        levels: [N] as fractions: between two levels, both count.
+        levels: [N] no whole numbers: the nearer of two levels counts more.
         base: width of a cell at level 0.
-        fallback: [3] where there is no cell.
+        fallback: [3] the light where there is no cell.
         result: [N, 3] output.
     """
     for n in range(positions.shape[0]):
         low = int(levels[n])
         fraction = levels[n] - low
+        # The point and its normal.
         px = positions[n, 0]
         py = positions[n, 1]
         pz = positions[n, 2]
@@ -718,7 +751,8 @@ def _interpolate(
             if steps == 2:
                 share = fraction if step == 1 else 1.0 - fraction
             share += 1e-3  # so that a point whose cells are all of one level finds them
-            # The eight cells whose middles surround the point begin at (x0, y0, z0).
+            # The middles of eight cells surround the point. (x0, y0, z0) is the place of the one
+            # with the smallest coordinates; places are numbered in widths of a cell.
             gx = px / size - 0.5
             gy = py / size - 0.5
             gz = pz / size - 0.5
@@ -733,14 +767,14 @@ def _interpolate(
                 wy = gy - y0 if j == 1 else 1.0 - gy + y0
                 wz = gz - z0 if k == 1 else 1.0 - gz + z0
                 near = wx * wy * wz + 1e-3
-                # A slanted surface may lie in cells of two or three sides.
+                # A slanted surface may lie in cells of two or three directions.
                 for axis in range(3):
                     along = nx if axis == 0 else (ny if axis == 1 else nz)
                     if abs(along) < 0.25:
                         continue
                     side = 2 * axis if along >= 0 else 2 * axis + 1
                     key = _key(level, int(x0) + i, int(y0) + j, int(z0) + k, side)
-                    place = _slot(table, key)
+                    place = _place_of_key(table, key)
                     if table[place] != key:
                         continue
                     cell = slots[place]
@@ -751,6 +785,7 @@ def _interpolate(
                     )
                     if agree <= 0.1:
                         continue
+                    # From the point's plane to the cell's point, in widths of the cell.
                     plane = (
                         abs(
                             (px - cell_position[cell, 0]) * nx
@@ -759,11 +794,11 @@ def _interpolate(
                         )
                         / size
                     )
-                    w = share * near * agree**4 / (1.0 + 30.0 * plane * plane)
-                    red += w * light[cell, 0]
-                    green += w * light[cell, 1]
-                    blue += w * light[cell, 2]
-                    weights += w
+                    weight = share * near * agree**4 / (1.0 + 30.0 * plane * plane)
+                    red += weight * light[cell, 0]
+                    green += weight * light[cell, 1]
+                    blue += weight * light[cell, 2]
+                    weights += weight
         if weights > 1e-9:
             result[n, 0] = red / weights
             result[n, 1] = green / weights
@@ -776,24 +811,25 @@ def _interpolate(
 
 @kernel
 def _smooth(
-    table: Any,
-    slots: Any,
-    cell_position: Any,
-    cell_normal: Any,
-    light: Any,
+    table: Longs,
+    slots: Longs,
+    cell_position: Floats,
+    cell_normal: Floats,
+    light: Floats,
     base: float,
     stride: int,
     tolerance: float,
-    result: Any,
+    result: Floats,
 ) -> None:
-    """Write the mean light of each cell and its 26 neighbours of the same level and side.
+    """Write the mean light of each cell and its 26 neighbours of the same level and direction.
 
     Neighbours count less if they lie out of the cell's plane, face another way, or differ in their
     light by more than `tolerance` (as a share); so edges and shadows stay.
 
     Args:
-        table, slots, cell_position, cell_normal: the cells, see `Cells`.
-        light: [C, 3] of the cells.
+        table, slots: [2^k] the hash table of C cells, see `Cells`.
+        cell_position, cell_normal: [C, 3] a point of a surface in each cell, and its unit normal.
+        light: [C, 3] irradiance of the cells.
         base: width of a cell at level 0.
         stride: distance to the neighbours, in cells.
         tolerance: share by which their light may differ.
@@ -801,10 +837,10 @@ def _smooth(
     """
     for place in range(table.shape[0]):
         key = table[place]
-        if key == -1:
+        if key == EMPTY:
             continue
         cell = slots[place]
-        # Back from the key to the side, the coordinates and the level; see `_key`.
+        # Back from the key to the direction, the coordinates and the level; see `_key`.
         side = key & 7
         rest = key >> 3
         z = (rest & COORDINATE_MASK) - OFFSET
@@ -819,10 +855,10 @@ def _smooth(
         for i in range(-1, 2):
             for j in range(-1, 2):
                 for k in range(-1, 2):
-                    other = _slot(
+                    other = _place_of_key(
                         table, _key(level, x + stride * i, y + stride * j, z + stride * k, side)
                     )
-                    if table[other] == -1:
+                    if table[other] == EMPTY:
                         continue
                     near = slots[other]
                     agree = (
@@ -837,14 +873,17 @@ def _smooth(
                         + (cell_position[near, 1] - cell_position[cell, 1]) * cell_normal[cell, 1]
                         + (cell_position[near, 2] - cell_position[cell, 2]) * cell_normal[cell, 2]
                     ) / (size * stride)
-                    own = light[cell, 0] + light[cell, 1] + light[cell, 2]
-                    their = light[near, 0] + light[near, 1] + light[near, 2]
-                    ratio = abs(own - their) / (tolerance * (own + their) / 2 + 1e-6)
-                    w = agree**4 / (1.0 + 30.0 * plane * plane) / (1.0 + ratio**4)
-                    red += w * light[near, 0]
-                    green += w * light[near, 1]
-                    blue += w * light[near, 2]
-                    weights += w
+                    # The difference of their light over the difference that is tolerated.
+                    own_light = light[cell, 0] + light[cell, 1] + light[cell, 2]
+                    near_light = light[near, 0] + light[near, 1] + light[near, 2]
+                    ratio = abs(own_light - near_light) / (
+                        tolerance * (own_light + near_light) / 2 + 1e-6
+                    )
+                    weight = agree**4 / (1.0 + 30.0 * plane * plane) / (1.0 + ratio**4)
+                    red += weight * light[near, 0]
+                    green += weight * light[near, 1]
+                    blue += weight * light[near, 2]
+                    weights += weight
         result[cell, 0] = red / weights
         result[cell, 1] = green / weights
         result[cell, 2] = blue / weights

@@ -117,17 +117,18 @@ def made_sky(
     sky = clear * (1 - grey) + overcast * grey * (0.6 + 0.4 * np.clip(up, 0, 1))
     glow = np.clip((directions * sun_direction).sum(-1, keepdims=True), 0, 1)
     sky = sky + (0.8 * glow**8 + 2.0 * glow**60) * (1 - 0.7 * grey) * np.array([1.0, 0.92, 0.8])
-    clouds = cloud_noise(rng, SKY_SHAPE, 4)[..., None]
+    clouds = cloud_noise(rng, SKY_SHAPE, spots_across=4)[..., None]
     cloudiness = np.clip((clouds - rng.uniform(-0.5, 1.0)) * 0.8, 0, 1) * np.clip(up * 4, 0, 1)
     sky = sky * (1 - cloudiness) + cloudiness * np.array([1.05, 1.05, 1.08])
 
     # Land: two rows of hills, and the ground.
-    skyline = (
-        0.03 + 0.08 * rng.random() * np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), 24))[..., None]
-    )
+    # The upper end of the hills in each column, as a sine of the elevation: 0.03 is 1.7 degrees.
+    hilliness = 0.08 * rng.random()
+    hills = np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), spots_across=24))[..., None]
+    skyline = 0.03 + hilliness * hills
     ground_color = srgb_to_linear(rng.uniform([0.25, 0.3, 0.15], [0.5, 0.5, 0.4]))
     far_color = ground_color * 0.6 + 0.15
-    texture = 1 + 0.35 * cloud_noise(rng, SKY_SHAPE, 40)[..., None]
+    texture = 1 + 0.35 * cloud_noise(rng, SKY_SHAPE, spots_across=40)[..., None]
     land = np.where(up < -0.02, ground_color * texture, far_color * texture)
     sky = np.where(up < skyline, land, sky)
     if backdrop is not None:
@@ -158,21 +159,29 @@ def _with_backdrop(
 
 
 def cloud_noise(
-    rng: np.random.Generator, shape: tuple[int, int], cells: int, octaves: int = 5
+    rng: np.random.Generator, shape: tuple[int, int], spots_across: int, octaves: int = 5
 ) -> NDArray[np.float64]:
-    """[h, w] smooth noise of mean 0 and deviation 1 with details of several sizes.
+    """[h, w] smooth noise of mean 0 and deviation 1 with spots of several sizes.
 
-    The noise repeats along both sides. The largest details are a `cells`-th of the width.
+    The noise repeats along both sides.
+
+    Args:
+        rng: the source of all random choices.
+        shape: height and width of the result.
+        spots_across: how many of the largest spots lie side by side across the width.
+        octaves: how many sizes of spots there are; each is half as large as the one before.
     """
     height, width = shape
     total = np.zeros(shape)
+    columns = spots_across
     strength = 1.0
     for _ in range(octaves):
-        rows = min(height, max(1, cells * height // width))
-        columns = min(width, cells)
-        total += strength * _stretched(rng.standard_normal((rows, columns)), shape)
+        rows = min(height, max(1, columns * height // width))
+        spots = rng.standard_normal((rows, min(width, columns)))
+        total += strength * _stretched(spots, shape)
+        # Smaller spots are weaker.
         strength *= 0.55
-        cells *= 2
+        columns *= 2
     return np.asarray((total - total.mean()) / max(float(total.std()), 1e-9))
 
 

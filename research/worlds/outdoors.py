@@ -11,6 +11,7 @@ import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +65,8 @@ class Scene:
     def surface(self, *kinds: str) -> Surface:
         """A random made surface of one of these kinds, each as likely as often it is given."""
         kind = kinds[int(self.rng.integers(len(kinds)))]
-        found = outdoor_surfaces(self.cache / "surfaces", kind)
-        return found[int(self.rng.integers(len(found)))]
+        surfaces = outdoor_surfaces(self.cache / "surfaces", kind)
+        return surfaces[int(self.rng.integers(len(surfaces)))]
 
     def find(self, names: str) -> list[Model]:
         """The library's models with these names, separated by spaces; others are left out.
@@ -78,7 +79,7 @@ class Scene:
     def is_free(self, box: Box, margin: float = 0.0) -> bool:
         """Whether nothing stands in a region, or within `margin` metres of its four sides.
 
-        A negative margin lets the region and what stands there overlap by as much.
+        With a negative margin, things may reach that far into the region.
         """
         wider = dataclasses.replace(
             box, x0=box.x0 - margin, y0=box.y0 - margin, x1=box.x1 + margin, y1=box.y1 + margin
@@ -119,11 +120,11 @@ class Scene:
             margin: free space to other things in metres; negative: how far it may reach into them.
             kept_share: share of its small triangles that stay, such as leaves; see `thinned`.
             painted: whether it gets another colour, as cars do; see `repainted`.
-            solid: whether nothing else may stand in the box around it. If not, as with trees, whose
-                crowns are above, only half a metre around its middle is taken.
+            solid: whether it takes up the whole box around it. If not, as with a tree, whose crown
+                is above, it takes up a square of half a metre around its middle.
         """
-        # Far from the camera only models with few triangles come into question. If none has few
-        # enough, the two with the fewest do.
+        # Far from the camera, only models with few triangles are used: up to a limit, or the two
+        # with the fewest if all have more.
         limit = TRIANGLES_NEAR / max(1.0, self.distance_to_camera(x, y) / NEAR_M) ** 2
         simple = [one for one in models if one.triangles * kept_share <= limit]
         if not simple:
@@ -265,41 +266,101 @@ def open_sky(rng: Rng, sun: NDArray[np.float32], overcast: bool) -> NDArray[np.f
         overcast: whether clouds cover all of it.
     """
     directions = sky_directions(SKY_SHAPE)
-    up = directions[..., 2]  # [h, w] sine of the elevation
+    sine = np.clip(directions[..., 2:], 0, 1)  # [h, w, 1] of the elevation; 0 below the horizon
+    sun_cosine = np.clip((directions * sun).sum(-1, keepdims=True), 0, 1)  # [h, w, 1]
+
+    # Clear sky: from blue at the zenith to pale at the horizon. Pale colours reach far up, hence
+    # the exponent below 1.
     zenith = np.array([0.16, 0.33, 0.8]) * rng.uniform(0.6, 1.0)
     horizon = np.array([0.72, 0.84, 1.0]) * rng.uniform(0.7, 1.0)
-    height_share = np.clip(up, 0, 1)[..., None]
-    sky = horizon + (zenith - horizon) * height_share**0.45
+    sky = horizon + (zenith - horizon) * sine**0.45
     # The air around the sun shines: broadly (power 6), and close to it (power 80).
-    sun_cosine = np.clip((directions * sun).sum(-1, keepdims=True), 0, 1)
     sky = sky + (0.5 * sun_cosine**6 + 1.5 * sun_cosine**80) * np.array([1.0, 0.9, 0.75])
 
-    # Clouds lie on a plane, of which a ray meets the point (x, y) / up: low clouds are far, small
+    clouds = _open_clouds(rng, directions, sun_cosine, overcast)
+    sky = sky + (clouds.color - sky) * clouds.cover
+    sky = _with_far_land(rng, sky, directions[..., 2:], horizon)
+    # Nothing is quite black.
+    return np.asarray(np.maximum(sky, 0.01), np.float32)
+
+
+class _Clouds(NamedTuple):
+    """Clouds in each direction of a sky."""
+
+    color: NDArray[np.float64]  # [h, w, 3] linear radiance
+    cover: NDArray[np.float64]  # [h, w, 1] share of the sky that they hide
+
+
+def _open_clouds(
+    rng: Rng,
+    directions: NDArray[np.float32],
+    sun_cosine: NDArray[np.float32],
+    overcast: bool,
+) -> _Clouds:
+    """Random clouds, single ones or, if `overcast`, a closed cover.
+
+    Args:
+        rng: for all random choices.
+        directions: [h, w, 3] unit vectors.
+        sun_cosine: [h, w, 1] cosine of the angle to the sun; 0 for more than 90 degrees.
+        overcast: whether they cover all of the sky.
+    """
+    # Clouds lie on a plane, which a ray meets at the point (x, y) / up: low clouds are far, small
     # and flat. 0.08 is added to `up`, so that the horizon is not infinitely far.
-    noise = cloud_noise(rng, (CLOUD_SIDE, CLOUD_SIDE), 5, 7)
-    scale = CLOUD_SIDE * rng.uniform(0.05, 0.12) / (np.clip(up, 0, 1) + 0.08)
+    up = np.clip(directions[..., 2], 0, 1)  # [h, w] sine of the elevation
+    noise = cloud_noise(rng, (CLOUD_SIDE, CLOUD_SIDE), spots_across=5, octaves=7)
+    pixels_per_unit = CLOUD_SIDE * rng.uniform(0.05, 0.12)  # of the plane, which is 1 above the eye
+    scale = pixels_per_unit / (up + 0.08)
     rows = (directions[..., 1] * scale).astype(np.int64) % CLOUD_SIDE
     columns = (directions[..., 0] * scale).astype(np.int64) % CLOUD_SIDE
-    # The noise has a deviation of 1: above a limit of −2.8 it is nearly everywhere.
-    density = noise[rows, columns] - (-2.8 if overcast else rng.uniform(0.0, 1.6))
-    cover = (np.clip(density * 1.4, 0, 1) * np.clip(up * 7, 0, 1))[..., None]
-    # Thick parts are darker below; those near the sun shine.
-    darkening = 0.12 * (density - 2.8) if overcast else 0.3 * np.clip(density, 0, 2.2)
-    brightness = 1.15 - darkening[..., None] + 0.8 * sun_cosine**12
-    clouds = np.array([1.0, 1.0, 1.02]) * brightness * (0.75 if overcast else 1.0)
-    sky = sky + (clouds - sky) * cover
 
-    # Woods at the horizon, 0.7 degrees (0.012) high and more, and the ground below them; both are
-    # pale, as they are far away.
-    wood_top = 0.012 + 0.012 * np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), 60))
+    # There are clouds where the noise exceeds a limit. It has a mean of 0 and a deviation of 1, so
+    # −2.8 is exceeded nearly everywhere, and 1.6 seldom.
+    limit = -2.8 if overcast else rng.uniform(0.0, 1.6)
+    density = noise[rows, columns] - limit
+    # They are closed from a density of 0.7 (1 / 1.4) on. Haze hides those below 8 degrees, whose
+    # sine is 1 / 7, more and more.
+    cover = np.clip(density * 1.4, 0, 1) * np.clip(up * 7, 0, 1)
+
+    # Thick parts are darker below; those near the sun shine. The mean density of a closed cover is
+    # 2.8; its thinner parts are brighter than the mean.
+    thickness = density - 2.8 if overcast else np.clip(density, 0, 2.2)
+    darkening = (0.12 if overcast else 0.3) * thickness
+    brightness = 1.15 - darkening[..., None] + 0.8 * sun_cosine**12
+    less_light = 0.75 if overcast else 1.0  # a closed cover lets less light through
+    color = np.array([1.0, 1.0, 1.02]) * brightness * less_light
+    return _Clouds(color, cover[..., None])
+
+
+def _with_far_land(
+    rng: Rng,
+    sky: NDArray[np.float64],
+    up: NDArray[np.float32],
+    horizon: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """[h, w, 3] the sky with woods at the horizon, and the ground below them.
+
+    Args:
+        rng: for all random choices.
+        sky: [h, w, 3] linear radiance.
+        up: [h, w, 1] sine of the elevation.
+        horizon: [3] colour of the clear sky at the horizon.
+    """
+    # The sine of the elevation up to which woods reach in each column: 0.012 (0.7 degrees) and
+    # more, with 60 hills around the horizon.
+    hills = np.abs(cloud_noise(rng, (1, SKY_SHAPE[1]), spots_across=60))[..., None]
+    wood_top = 0.012 + 0.012 * hills
+
+    # Both are paler than near ones, because air lies before them: the woods get a share of 60 % of
+    # the horizon's colour, the ground one of grey.
     wood = np.array([0.1, 0.14, 0.07]) * rng.uniform(0.7, 1.3)
     paleness = rng.uniform(0.25, 0.6)
     wood = wood * (1 - paleness) + paleness * 0.6 * horizon
-    treetops = 1 + 0.2 * cloud_noise(rng, SKY_SHAPE, 120, 3)[..., None]
+    treetops = 1 + 0.2 * cloud_noise(rng, SKY_SHAPE, spots_across=120, octaves=3)[..., None]
     ground = np.array([0.2, 0.22, 0.13]) * (1 - 0.3 * paleness) + 0.15 * paleness
-    land = np.where(up[..., None] < -0.01, ground, wood * treetops)
-    sky = np.where((up < wood_top)[..., None], land, sky)
-    return np.asarray(np.maximum(sky, 0.01), np.float32)
+
+    land = np.where(up < -0.01, ground, wood * treetops)  # from 0.6 degrees below the horizon
+    return np.where(up < wood_top, land, sky)
 
 
 def held_camera(

@@ -184,7 +184,7 @@ def _wood_grain(rng: Rng, stretch: int) -> Floats:
     fibres = smooth_noise(rng, spots_across=4, octaves=7)
 
     # Noise with few columns, each of which is repeated `stretch` times: it is stretched along x.
-    narrow_noise = cloud_noise(rng, (SIDE, SIDE // stretch), cells=4, octaves=5)
+    narrow_noise = cloud_noise(rng, (SIDE, SIDE // stretch), spots_across=4, octaves=5)
     stepped = np.repeat(narrow_noise, stretch, 1)
     missing_columns = SIDE - stepped.shape[1]  # if SIDE is no multiple of `stretch`
     stepped = np.pad(stepped, ((0, 0), (0, missing_columns)), mode="wrap")

@@ -92,8 +92,8 @@ def track(rng: Rng, library: Library) -> WorldPlan:
     parts = [surroundings]
     used = {model.entry.key}
 
-    # Up to eight cars, on the part of the road around the origin. Three of four stand ahead, where
-    # the cameras look; all drive that way.
+    # Two to eight cars, on the part of the road around the origin. Three of four stand ahead, where
+    # the cameras look; all drive that way. Where a drawn place is not on the road, there is none.
     to_left = np.array([-ahead[1], ahead[0]])
     road = whole_road - middle
     road = road[np.linalg.norm(road[:, :, :2].mean(1), axis=1) < CARS_REACH_M]
@@ -106,31 +106,11 @@ def track(rng: Rng, library: Library) -> WorldPlan:
         if car is None or point is None:
             continue
         heading = _along_road(road, point.place)
-        # `_along_road` gives either of both senses.
+        # `_along_road` gives one of two opposite directions.
         if heading @ ahead < 0:
             heading = -heading
         parts.append(_car_on_road(library.mesh(car), point, heading))
         used.add(car.entry.key)
-
-    def draw(own: Rng, height: int, width_px: int) -> Viewpoint:
-        """A random camera near the origin, beside the road, on it or in its middle.
-
-        It looks along the road; if it is off the middle, often a little towards the other side.
-        """
-        # Metres to the left of the road's middle: on the road, or up to 4 m beside it.
-        left = own.uniform(-1.0, 1.0) * half_width if own.random() < 0.5 else 0.0
-        if own.random() < 0.5:
-            left = own.choice([-1, 1]) * (half_width + own.uniform(0.5, 4.0))
-        point = to_left * left + ahead * own.uniform(-4, 4)
-        ground = _ground_height(surroundings, point)
-        # A standing person's eyes; sometimes stooping.
-        above = own.uniform(1.3, 1.75) if own.random() < 0.8 else own.uniform(0.6, 1.3)
-        eye = (float(point[0]), float(point[1]), ground + float(above))
-        azimuth = math.atan2(ahead[1], ahead[0]) + own.normal(0, 0.35)
-        if left and own.random() < 0.6:
-            # From the left side to the right is a turn to smaller azimuths.
-            azimuth += math.copysign(own.uniform(0.1, 0.8), -left)
-        return held_camera(own, eye, azimuth, height, width_px)
 
     return WorldPlan(
         OUTDOORS,
@@ -138,10 +118,50 @@ def track(rng: Rng, library: Library) -> WorldPlan:
         mesh=joined(parts),
         pictures=pictures,
         lights=daylight(rng),
-        draw_viewpoint=draw,
+        draw_viewpoint=functools.partial(_draw_viewpoint, surroundings, ahead, half_width),
         models=tuple(sorted(used)),
         coarse_m=1.5,  # more than the 1 m of streets, because places are larger
     )
+
+
+def _draw_viewpoint(
+    surroundings: Mesh,
+    ahead: NDArray[np.float64],
+    half_width: float,
+    rng: Rng,
+    height_px: int,
+    width_px: int,
+) -> Viewpoint:
+    """A random camera near the origin, beside the road, on it or in its middle.
+
+    It looks along the road; if it is off the middle, often a little towards the other side.
+
+    Args:
+        surroundings: the track around the origin, which lies in the middle of the road.
+        ahead: [2] unit vector in x and y along the road.
+        half_width: of the road in metres.
+        rng: for all random choices.
+        height_px, width_px: of the picture.
+    """
+    # Metres to the left of the road's middle. In half of all cases the camera is beside the road;
+    # else anywhere on the road or, as often, in its middle.
+    left = rng.uniform(-1.0, 1.0) * half_width if rng.random() < 0.5 else 0.0
+    is_beside_road = rng.random() < 0.5
+    if is_beside_road:
+        left = rng.choice([-1, 1]) * (half_width + rng.uniform(0.5, 4.0))
+    to_left = np.array([-ahead[1], ahead[0]])
+    point = to_left * left + ahead * rng.uniform(-4, 4)  # [2] x and y
+
+    # Metres of the eyes above the ground: of one who stands or, in 20 %, stoops.
+    above = rng.uniform(1.3, 1.75) if rng.random() < 0.8 else rng.uniform(0.6, 1.3)
+    ground = _ground_height(surroundings, point)
+    eye = (float(point[0]), float(point[1]), ground + float(above))
+
+    azimuth = math.atan2(ahead[1], ahead[0]) + rng.normal(0, 0.35)  # radians
+    if left and rng.random() < 0.6:
+        # Towards the other side: who stands to the left turns to smaller azimuths.
+        azimuth += math.copysign(rng.uniform(0.1, 0.8), -left)
+    return held_camera(rng, eye, azimuth, height_px, width_px)
 
 
 def road_triangles(mesh: Mesh, name: str) -> NDArray[np.int64]:
@@ -149,7 +169,7 @@ def road_triangles(mesh: Mesh, name: str) -> NDArray[np.int64]:
 
     Args:
         mesh: the track.
-        name: the track's; the names of its pictures in the library begin with it.
+        name: the track's name, with which the names of its pictures in the library begin.
     """
     is_road = np.array([_is_road(one, name) for one in mesh.materials], bool)
     sides = mesh.corners[:, 1:].astype(np.float64) - mesh.corners[:, :1]
@@ -160,9 +180,9 @@ def road_triangles(mesh: Mesh, name: str) -> NDArray[np.int64]:
 
 
 def _is_road(material: Material, track_name: str) -> bool:
-    """Whether a material's picture is that of a road.
+    """Whether a material's picture is that of a road, by the words in the picture's name.
 
-    The words of its name tell, without the track's name, which may have such words, too.
+    The name begins with the track's name, which may have such words, too, and is left out.
     """
     if material.texture is None:
         return False
@@ -173,7 +193,7 @@ def _is_road(material: Material, track_name: str) -> bool:
 
 
 def _along_road(road: Floats, place: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[2] unit vector in x and y along the road at a place, in either of its two senses.
+    """[2] unit vector in x and y along the road at a place, in one of its two directions.
 
     It is the direction in which the corners of the road's triangles near the place spread most.
 
@@ -183,8 +203,10 @@ def _along_road(road: Floats, place: NDArray[np.floating]) -> NDArray[np.float64
     """
     points = road.reshape(-1, 3)[:, :2].astype(np.float64)
     distance = np.linalg.norm(points - place[:2], axis=1)
-    # Those within 25 m, but at least about eight: triangles may be long.
-    nearby = points[distance < max(25.0, float(np.sort(distance)[min(8, len(distance) - 1)]))]
+    # Those within 25 m. If these are fewer than eight, because triangles are long, the eight
+    # nearest.
+    ninth_distance = float(np.sort(distance)[min(8, len(distance) - 1)])
+    nearby = points[distance < max(25.0, ninth_distance)]
     # A little is added on the diagonal, so that points at one place have a direction, too.
     spread = np.cov((nearby - nearby.mean(0)).T) + 1e-6 * np.eye(2)
     _, axes = np.linalg.eigh(spread)  # columns, the one with the largest spread last
@@ -323,7 +345,7 @@ def _with_grain(mesh: Mesh) -> _MeshWithPictures:
 def _may_get_grain(texture: str) -> bool:
     """Whether a picture's file is of ground or walls: not of trees, people, sky or letters.
 
-    Its name tells, and that it has no holes: pictures with alpha are of leaves or fences.
+    It is not if a word of its name says so, or if it has alpha, as leaves and fences do.
     """
     name = Path(texture).name.lower()
     if any(word in name for word in NO_GRAIN_WORDS):
@@ -336,8 +358,8 @@ def _may_get_grain(texture: str) -> bool:
 def fine_picture(file: str) -> Bytes:
     """[H, W, 3] a file's picture, enlarged, with noise in place of the fine detail that it lacks.
 
-    It becomes as many times larger, a whole number, as its longer side fits into FINE_PX. A picture
-    that would have to be less than twice as large stays as it is.
+    It is enlarged by the greatest whole number with which its longer side is at most FINE_PX. A
+    picture that is larger than half of that stays as it is.
 
     `file` is the path of a picture without alpha.
     """
@@ -352,7 +374,9 @@ def fine_picture(file: str) -> Bytes:
     rng = np.random.default_rng(len(Path(file).name))
     shape = (size[1], size[0])
     # Noise from pixel to pixel, and stronger noise with spots of 6 pixels and less.
-    grain = 0.55 * rng.standard_normal(shape) + cloud_noise(rng, shape, max(8, size[0] // 6), 3)
+    pixel_noise = rng.standard_normal(shape)
+    spots = cloud_noise(rng, shape, spots_across=max(8, size[0] // 6), octaves=3)
+    grain = 0.55 * pixel_noise + spots
     # Both together have a deviation of about 1.1: pixels get about 10 % brighter or darker.
     fine = large * (1 + 0.09 * grain.astype(np.float32))[..., None]
     return np.asarray(np.clip(fine, 0, 255), np.uint8)

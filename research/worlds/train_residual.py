@@ -175,13 +175,14 @@ def mixed(usual: Sequence[Path], worlds: Sequence[Path], share: float) -> list[P
     Args:
         usual: files of crops of the usual sources; at least one.
         worlds: files of crops of worlds; at least one.
-        share: in 0..1, both excluded: how much of the result shall be of `worlds`. If they are less
-            than that, they are repeated in turn; if they are more, `usual` is.
+        share: how much of the result shall be of `worlds`; above 0 and below 1.
     """
-    # To `worlds` as they are belong this many usual files, and the other way round. One of the two
-    # numbers is not above the files that there are; then those stay as they are.
-    usual_count = max(len(usual), round(len(worlds) * (1 - share) / share))
-    world_count = max(len(worlds), round(len(usual) * share / (1 - share)))
+    # How many files of one kind give the right share together with all files of the other kind. The
+    # kind that has fewer is repeated; the other kind has enough, and stays as it is.
+    usual_needed = round(len(worlds) * (1 - share) / share)
+    worlds_needed = round(len(usual) * share / (1 - share))
+    usual_count = max(len(usual), usual_needed)
+    world_count = max(len(worlds), worlds_needed)
     return [
         *itertools.islice(itertools.cycle(usual), usual_count),
         *itertools.islice(itertools.cycle(worlds), world_count),
