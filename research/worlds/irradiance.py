@@ -609,7 +609,7 @@ def _side_of_normal(x: float, y: float, z: float) -> int:
 @kernel
 def _place_of_key(table: Longs, key: int) -> int:
     """The place of a key in a hash table `table` [2^k], or the free place where it belongs."""
-    mask = table.shape[0] - 1
+    mask = len(table) - 1
     mixed = key * HASH_FACTOR
     place = (mixed >> 20) & mask  # the upper bits are mixed best
     # Where another key stands already, the next place is taken.

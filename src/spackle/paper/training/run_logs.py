@@ -39,7 +39,7 @@ class RunLogs:
 
         Args:
             step: number of steps done.
-            seconds: that the run has taken so far, over all restarts.
+            seconds: how long the run has taken so far, over all restarts.
             values: finite numbers by name, such as "train/loss" and "validation/hole_psnr".
         """
         line = {"step": step, "seconds": round(seconds, 3), **values}
