@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from depth_loss import DepthLossWeights
-from frames import Group, Measured, Readable, of_camera, of_scenes
+from frames import Group, Measured, of_camera, of_scenes
 from made_rooms import RoomView, judged_rooms, of_rooms
 from pydantic import Field
 
@@ -47,25 +47,19 @@ class LiteShares(RecipePart):
 class LiteData(RecipePart):
     """The sources of photos with depth."""
 
-    photos: OptionalPath = (
-        None  # a folder, with its subfolders; textures of synthetic scenes are cut from them
-    )
-    rgbd: Annotated[
-        tuple[RgbdFolder, ...], MAY_CHANGE_ON_RESUME
-    ] = ()  # their focal lengths are not used
+    # A folder of photos, with its subfolders. Textures of synthetic scenes are cut from them.
+    photos: OptionalPath = None
+    # Folders of depth cameras; their focal lengths are not used.
+    rgbd: Annotated[tuple[RgbdFolder, ...], MAY_CHANGE_ON_RESUME] = ()
     stereo: OptionalPath = None  # a folder of scenes, each with a scene.json
     worlds: OptionalPath = None  # a folder of furnished rooms, made by research/worlds
     made: Count = 4900  # number of synthetic scenes
-    teacher: Path | None = (
-        None  # weights of an earlier run; its predictions for `photos` become training data
-    )
-    guesses: Count = 1500  # at most this number of photos
+    # Weights of an earlier run; what this network guesses of `photos` becomes training data.
+    teacher: Path | None = None
+    guesses: Count = 1500  # at most so many photos get guesses
     shares: LiteShares = LiteShares()
-    # height and width of pictures; swapped in a fifth of the steps
-    size: tuple[Side, Side] = (
-        256,
-        320,
-    )
+    # Height and width of pictures; swapped in a fifth of the steps.
+    size: tuple[Side, Side] = (256, 320)
     # Factors on `size`; each step draws one, because the base uses several sizes.
     scales: Annotated[tuple[Scale, ...], Field(min_length=1)] = (1.0,)
     cache: OptionalPath = None  # a folder for synthetic scenes and guesses; None: inside the output
@@ -73,20 +67,17 @@ class LiteData(RecipePart):
     # Share of each folder of `rgbd` for validation: the last frames by name, because neighbouring
     # frames are alike.
     validation: Annotated[float, Field(ge=0, le=0.9)] = 0.2
-    validation_stereo: OptionalPath = (
-        None  # scenes for validation; all scenes of `stereo` are for training
-    )
-    validation_worlds: OptionalPath = (
-        None  # furnished rooms for validation; all rooms of `worlds` are for training
-    )
+    # Scenes for validation; all scenes of `stereo` are for training.
+    validation_stereo: OptionalPath = None
+    # Furnished rooms for validation; all rooms of `worlds` are for training.
+    validation_worlds: OptionalPath = None
 
 
 class LiteOptim(OptimRecipe):
     """Settings of the optimiser, and of the pretrained encoder."""
 
-    encoder_rate: Annotated[float, Field(ge=0, le=10)] = (
-        0.2  # factor on the encoder's learning rate
-    )
+    # Factor on the encoder's learning rate.
+    encoder_rate: Annotated[float, Field(ge=0, le=10)] = 0.2
     # How many of the encoder's first stages are frozen, with its stem; 0: nothing is frozen.
     frozen: Annotated[int, Field(ge=0, le=len(STAGES["lite2"]))] = 2
 
@@ -98,15 +89,14 @@ class LiteRecipe(AnyRecipe):
     loss: DepthLossWeights = DepthLossWeights()
     optim: LiteOptim = LiteOptim()
     network: EncoderSize = "lite2"  # size of the encoder: EfficientNet-Lite0 or -Lite2
-    encoder: Path | None = (
-        None  # its .pth file; None: from the installed package; "random": random weights
-    )
+    # The encoder's .pth file. None: from the installed package; "random": random weights.
+    encoder: Path | None = None
     init: Path | None = None  # initial weights of the whole network
 
 
 SCENES_VERSION = 5  # increases whenever the same photos would give different scenes
-GUESSES_VERSION = 1  # the same for guesses by the same weights
-# Keys of LiteData that say where files lie; only the files' names are part of the digest.
+GUESSES_VERSION = 1  # increases whenever the same photos and weights would give different guesses
+# Keys of LiteData that say where files lie. They are no part of the digest; the files' names are.
 PLACES = (
     "photos",
     "stereo",
@@ -125,12 +115,12 @@ class LiteFiles:
     """The files of a recipe, sorted; sources without a share are empty."""
 
     data: LiteData
-    photos: Sequence[Path]
+    photos: Sequence[Path]  # from which textures of synthetic scenes are cut
     stereo: Sequence[Measured]
     rgbd: Sequence[Measured]
-    guessed: Sequence[Path]  # photos for which the teacher makes guesses
+    photos_to_guess: Sequence[Path]  # photos whose depth the teacher guesses
     worlds: Sequence[RoomView]
-    groups: Sequence[Group]
+    groups: Sequence[Group]  # for validation
 
     @staticmethod
     def of(data: LiteData) -> LiteFiles:
@@ -140,46 +130,50 @@ class LiteFiles:
             InputError: a folder is missing or has no such files, or there is nothing to train on or
                 to validate with.
         """
-        shares, groups = data.shares, []
+        shares = data.shares
+        groups: list[Group] = []
         photos = [] if data.photos is None else find_photo_files(data.photos, "data.photos")
         stereo = [] if data.stereo is None else of_scenes(data.stereo, "data.stereo", right=True)
         rgbd: list[Measured] = []
         for camera in data.rgbd:
-            learned, judged = of_camera(camera, data.validation)
-            rgbd += learned
-            groups.append(Group(camera.folder.resolve().name, judged))
+            training_frames, validation_frames = of_camera(camera, data.validation)
+            rgbd += training_frames
+            groups.append(Group(camera.folder.resolve().name, validation_frames))
         if data.validation_stereo is not None:
-            groups.append(
-                Group(STEREO, of_scenes(data.validation_stereo, "data.validation_stereo"))
-            )
+            validation_photos = of_scenes(data.validation_stereo, "data.validation_stereo")
+            groups.append(Group(STEREO, validation_photos))
             _check_apart(
-                [file.path for file in stereo],
-                [file.path for file in groups[-1].files if isinstance(file, Measured)],
+                [photo.path for photo in stereo],
+                [photo.path for photo in validation_photos],
                 f"{data.validation_stereo}: data.validation_stereo has scenes of data.stereo",
             )
         rooms: Sequence[RoomView] = ()
         if shares.worlds and data.worlds is not None:
             rooms = of_rooms(data.worlds)
         if data.validation_worlds is not None:
-            photos_of_rooms = judged_rooms(data.validation_worlds)
-            groups.append(Group("rooms", photos_of_rooms))
+            validation_rooms = judged_rooms(data.validation_worlds)
+            groups.append(Group("rooms", validation_rooms))
             _check_apart(
                 [view.archive for view in rooms],
-                [room.view.archive for room in photos_of_rooms],
+                [room.view.archive for room in validation_rooms],
                 f"{data.validation_worlds}: data.validation_worlds has rooms of data.worlds",
             )
         if data.teacher is not None and not data.teacher.is_file():
             raise InputError(f"{data.teacher}: no such file, but data.teacher names it")
+        photos_to_guess: Sequence[Path] = ()
+        if shares.guessed and data.teacher is not None:
+            photos_to_guess = _spread(photos, data.guesses)
         files = LiteFiles(
-            data,
-            photos if shares.made else (),
-            stereo if shares.stereo else (),
-            rgbd if shares.rgbd else (),
-            _spread(photos, data.guesses) if shares.guessed and data.teacher is not None else (),
-            rooms,
-            _with_own_names([group for group in groups if group.files]),
+            data=data,
+            photos=photos if shares.made else (),
+            stereo=stereo if shares.stereo else (),
+            rgbd=rgbd if shares.rgbd else (),
+            photos_to_guess=photos_to_guess,
+            worlds=rooms,
+            groups=_with_own_names([group for group in groups if group.files]),
         )
-        if not (files.photos or files.stereo or files.rgbd or files.guessed or files.worlds):
+        sources = (files.photos, files.stereo, files.rgbd, files.photos_to_guess, files.worlds)
+        if not any(sources):
             raise InputError(
                 "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or "
                 "data.worlds, and a share above 0"
@@ -187,78 +181,71 @@ class LiteFiles:
         if not files.groups:
             raise InputError(
                 "the recipe has nothing to judge the network by: give data.rgbd with a share in "
-                "data.validation, "
-                "scenes as data.validation_stereo=FOLDER, or rooms as data.validation_worlds=FOLDER"
+                "data.validation, scenes as data.validation_stereo=FOLDER, or rooms as "
+                "data.validation_worlds=FOLDER"
             )
         return files
 
     @property
     def scenes_digest(self) -> str:
-        """Twelve digits that identify the synthetic scenes, whatever the photos' folder and the
-        number of scenes.
+        """Twelve digits that identify the synthetic scenes.
+
+        They depend neither on where the photos' folder lies nor on the number of scenes.
         """
-        return short_digest(
-            (SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos))
-        )
+        photo_names = self._names_in_photos_folder(self.photos)
+        return short_digest((SCENES_VERSION, self.data.seed, list(self.data.size), photo_names))
 
     @property
     def guesses_digest(self) -> str:
-        """Twelve digits that identify the photos and the teacher (or none), wherever the files
-        are.
-        """
-        teacher = self.data.teacher
-        weights = (
-            hashlib.sha256(teacher.read_bytes()).hexdigest()
-            if teacher is not None and self.guessed
-            else ""
-        )
-        return short_digest((GUESSES_VERSION, weights, self._below(self.guessed)))
+        """Twelve digits that identify what the teacher guesses: its weights, and the photos.
 
-    def _below(self, files: Sequence[Path]) -> list[str]:
+        They do not depend on where these files lie.
+        """
+        weights_digest = ""  # without guesses
+        if self.data.teacher is not None and self.photos_to_guess:
+            weights_digest = hashlib.sha256(self.data.teacher.read_bytes()).hexdigest()
+        photo_names = self._names_in_photos_folder(self.photos_to_guess)
+        return short_digest((GUESSES_VERSION, weights_digest, photo_names))
+
+    def _names_in_photos_folder(self, photos: Sequence[Path]) -> list[str]:
+        """The photos' paths relative to the folder `data.photos`, which holds them all."""
         folder = self.data.photos
-        return [] if folder is None else [file.relative_to(folder).as_posix() for file in files]
+        return [] if folder is None else [photo.relative_to(folder).as_posix() for photo in photos]
 
     @property
     def digest(self) -> str:
         """Twelve digits that identify all training and validation data."""
-        facts = self.data.model_dump(mode="json")
+        settings = self.data.model_dump(mode="json")
         for name in PLACES:
-            facts.pop(name)
-        names = [
-            _names(files)
-            for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))
-        ]
+            settings.pop(name)
+        frame_lists = (self.stereo, self.rgbd, *(group.files for group in self.groups))
+        frames = [[frame.identity for frame in frame_list] for frame_list in frame_lists]
         rooms = [view.identity for view in self.worlds]
-        return short_digest((self.scenes_digest, self.guesses_digest, facts, names, rooms))
+        return short_digest((self.scenes_digest, self.guesses_digest, settings, frames, rooms))
 
 
 def _spread(photos: Sequence[Path], count: int) -> Sequence[Path]:
     """`count` photos, evenly spaced over the folder; all if there are fewer."""
-    return (
-        [photos[number * len(photos) // count] for number in range(count)]
-        if count < len(photos)
-        else photos
-    )
+    if count >= len(photos):
+        return photos
+    return [photos[number * len(photos) // count] for number in range(count)]
 
 
-def _check_apart(learned: Sequence[Path], judged: Sequence[Path], fault: str) -> None:
+def _check_apart(training: Sequence[Path], validation: Sequence[Path], fault: str) -> None:
     """InputError, which begins with `fault`, if a file is used for both training and validation."""
-    both = {path.resolve() for path in learned} & {path.resolve() for path in judged}
-    if both:
-        raise InputError(f"{fault} in it, such as {min(both)}")
+    shared = {path.resolve() for path in training} & {path.resolve() for path in validation}
+    if shared:
+        raise InputError(f"{fault} in it, such as {min(shared)}")
 
 
 def _with_own_names(groups: Sequence[Group]) -> list[Group]:
-    """The same groups; if several have one name, the later ones are numbered."""
+    """The same groups; if several have one name, the later ones are numbered from 2 on."""
     named: dict[str, Group] = {}
     for group in groups:
-        name, number = group.name, 1
+        name = group.name
+        number = 1
         while name in named:
             number += 1
             name = f"{group.name}-{number}"
         named[name] = dataclasses.replace(group, name=name)
     return list(named.values())
-
-
-def _names(files: Sequence[Readable]) -> list[tuple[str | float | None, ...]]:
-    return [file.identity for file in files]

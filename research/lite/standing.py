@@ -15,7 +15,7 @@ from frames import Frame
 from objects import UP, Array, Rng, cut, flat, ground, lean, pole, solid, turn
 from ray_tracer import BOX, CYLINDER, ELLIPSOID, SHEET, Floats, Solid, trace
 from scene_kinds import Scene
-from synthetic_scenes import SAMPLES, drawn
+from synthetic_scenes import SAMPLES, render_scene
 from textures import LATTICE, LEAVES, RING, WHOLE
 from torch import Tensor
 
@@ -237,7 +237,7 @@ def labelled_scene(rng: Rng, photos: DrawPhoto, height: int, width: int) -> tupl
         )
         return [*behind, *(part for thing in things for part in thing)], pitch
 
-    seen = drawn(rng, photos, height, width, build)
+    seen = render_scene(rng, photos, height, width, build)
     # Render again under ambient light, with the number of its object as each solid's grey.
     marks = [owner / MOST for owner in owners]
     skins = np.stack(

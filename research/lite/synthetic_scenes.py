@@ -1,6 +1,4 @@
-"""Synthetic scenes with exact depth and textures cut from photos, stored with several scenes per
-file.
-"""
+"""Synthetic scenes with exact depth and textures cut from photos, several in a file."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ from spackle.paper.training.composites import DrawPhoto
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path
 
-SAMPLES = 2  # rays per pixel in each direction
+SAMPLES = 2  # a pixel has 2 × 2 rays
 KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # with their relative frequencies
     (room, 0.17),
     (table, 0.09),
@@ -43,72 +41,92 @@ def synthetic_scene(rng: Rng, photos: DrawPhoto, height: int, width: int) -> tup
 
     Args:
         rng: the source of all random choices.
-        photos: gives photos, from which textures are cut.
+        photos: gives random photos, from which textures are cut.
         height, width: in pixels.
     """
-    picture = drawn(
-        rng,
-        photos,
-        height,
-        width,
-        KINDS[int(rng.choice(len(KINDS), p=[share for _, share in KINDS]))][0],
-    )
+    shares = [share for _, share in KINDS]
+    build_scene, _ = KINDS[int(rng.choice(len(KINDS), p=shares))]
+    picture = render_scene(rng, photos, height, width, build_scene)
     return picture.rgb, picture.inverse_depth
 
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A rendered scene and its inputs."""
+    """A rendered scene, and what it was rendered from."""
 
     rgb: Tensor  # [H, W, 3] sRGB
-    inverse_depth: Tensor  # [H, W] in 1/m
+    inverse_depth: Tensor  # [H, W] in 1/m, 0 in the sky
     solids: list[Solid]
-    skins: Floats  # [T, S, S, 4] textures of the solids
-    rays: Floats  # [N, 3], `SAMPLES`² per pixel
+    skins: Floats  # [T, S, S, 4] textures of the solids: colours 0..1 and coverage
+    rays: Floats  # [N, 3] directions with z = 1 along the camera's axis, `SAMPLES`² for each pixel
 
 
-def drawn(
-    rng: Rng, photos: DrawPhoto, height: int, width: int, build: Callable[[Rng], Scene]
+def render_scene(
+    rng: Rng, photos: DrawPhoto, height: int, width: int, build_scene: Callable[[Rng], Scene]
 ) -> Picture:
-    """Render a scene made by `build`; see `synthetic_scene`."""
+    """Render a random scene of one kind, with random textures, light and camera.
+
+    Args:
+        rng: the source of all random choices.
+        photos: gives random photos, from which textures are cut.
+        height, width: of the picture in pixels.
+        build_scene: makes the solids, and chooses how far down the camera looks.
+    """
     skins = textures(rng, photos)
-    solids, pitch = build(rng)
-    focal = width * rng.uniform(0.7, 1.5)
-    rays = _rays(height, width, focal, pitch, math.radians(rng.normal(0, 2.5)))
-    behind = sky(rng, photos, height, width).repeat(SAMPLES, 0).repeat(SAMPLES, 1).reshape(-1, 3)
-    # y points down
-    above = rng.normal(size=3) * (1.0, 0.4, 1.0) - (
-        0.0,
-        rng.uniform(0.5, 1.5),
-        0.5,
-    )
-    light = (above / np.linalg.norm(above)).astype(np.float32)
-    colors, distances = trace(solids, skins, rays, light, rng.uniform(0.25, 0.9), behind)
-    fine = (height * SAMPLES, width * SAMPLES)
-    rgb = _exposed(rng, torch.from_numpy(colors))
-    rgb = avg_pool2d(rgb.reshape(*fine, 3).permute(2, 0, 1)[None], SAMPLES)[0]
-    # one per pixel: no averages
-    inverse = torch.from_numpy(1.0 / distances).reshape(fine)[::SAMPLES, ::SAMPLES]
-    return Picture(rgb.permute(1, 2, 0).contiguous(), inverse.contiguous(), solids, skins, rays)
+    solids, pitch = build_scene(rng)
+    focal_px = width * rng.uniform(0.7, 1.5)
+    roll = math.radians(rng.normal(0, 2.5))
+    rays = _rays(height, width, focal_px, pitch, roll)
+    sky_pixels = sky(rng, photos, height, width)  # [H, W, 3]
+    sky_colors = sky_pixels.repeat(SAMPLES, 0).repeat(SAMPLES, 1).reshape(-1, 3)  # of each ray
+
+    # The light comes from above, where y is negative, and rather from behind the camera.
+    to_light = rng.normal(size=3) * (1.0, 0.4, 1.0) - (0.0, rng.uniform(0.5, 1.5), 0.5)
+    light = (to_light / np.linalg.norm(to_light)).astype(np.float32)
+    ambient = rng.uniform(0.25, 0.9)  # share of light that comes from everywhere
+    colors, distances = trace(solids, skins, rays, light, ambient, sky_colors)
+
+    # Colours are means over the rays of a pixel; its depth is that of one ray, because a mean of
+    # two surfaces lies on neither.
+    fine_size = (height * SAMPLES, width * SAMPLES)
+    fine_rgb = _exposed(rng, torch.from_numpy(colors)).reshape(*fine_size, 3)
+    rgb = avg_pool2d(fine_rgb.permute(2, 0, 1)[None], SAMPLES)[0].permute(1, 2, 0)
+    fine_inverse_depth = torch.from_numpy(1.0 / distances).reshape(fine_size)
+    inverse_depth = fine_inverse_depth[::SAMPLES, ::SAMPLES]
+    return Picture(rgb.contiguous(), inverse_depth.contiguous(), solids, skins, rays)
 
 
 def _exposed(rng: Rng, rgb: Tensor) -> Tensor:
-    """Scale to the usual brightness of photos; brighter values become white."""
-    return (rgb * (rng.uniform(0.25, 0.6) / float(rgb.mean().clamp_min(0.02)))).clamp(0, 1)
+    """Colours [N, 3], scaled to the usual brightness of photos; brighter values become white."""
+    wanted_mean = rng.uniform(0.25, 0.6)
+    factor = wanted_mean / float(rgb.mean().clamp_min(0.02))
+    return (rgb * factor).clamp(0, 1)
 
 
-def _rays(height: int, width: int, focal: float, pitch: float, roll: float) -> Floats:
-    """[N, 3] directions of depth one, for `SAMPLES`² rays a pixel, rotated by `pitch` (down) and
-    `roll`.
+def _rays(height: int, width: int, focal_px: float, pitch: float, roll: float) -> Floats:
+    """[N, 3] directions of `SAMPLES`² rays for each pixel, in a world with y down.
+
+    Along the camera's axis they all have the length 1, so that distances in units of their length
+    are depths.
+
+    Args:
+        height, width: of the picture in pixels.
+        focal_px: focal length.
+        pitch: how far the camera looks down, in radians.
+        roll: how far it is turned about its axis, in radians.
     """
-    y, x = np.mgrid[: height * SAMPLES, : width * SAMPLES].astype(np.float32)
-    x, y = ((x + 0.5) / SAMPLES - width / 2) / focal, ((y + 0.5) / SAMPLES - height / 2) / focal
-    x, y = x * math.cos(roll) - y * math.sin(roll), x * math.sin(roll) + y * math.cos(roll)
-    c, s = math.cos(pitch), math.sin(pitch)
-    return np.stack([x, y * c + s, c - y * s], -1).reshape(-1, 3).astype(np.float32)
+    row, column = np.mgrid[: height * SAMPLES, : width * SAMPLES].astype(np.float32)
+    x = ((column + 0.5) / SAMPLES - width / 2) / focal_px
+    y = ((row + 0.5) / SAMPLES - height / 2) / focal_px
+    rolled_x = x * math.cos(roll) - y * math.sin(roll)
+    rolled_y = x * math.sin(roll) + y * math.cos(roll)
+    cosine = math.cos(pitch)
+    sine = math.sin(pitch)
+    directions = np.stack([rolled_x, rolled_y * cosine + sine, cosine - rolled_y * sine], -1)
+    return directions.reshape(-1, 3).astype(np.float32)
 
 
-PER_FILE = 50
+PER_FILE = 50  # scenes in a file
 UPRIGHT = 0.25  # share of upright scenes
 TRIES = 20  # how many photos in a row may be unreadable
 Warn = Callable[[str], None]
@@ -118,7 +136,10 @@ class PhotoDraw:
     """Draws random photos; unreadable photos are reported once and skipped."""
 
     def __init__(self, files: Sequence[Path], warn: Warn) -> None:
-        self.files, self.warn, self.bad = files, warn, set[Path]()
+        """Keep the photos' files; `warn` is called with a line for each unreadable one."""
+        self.files = files
+        self.warn = warn
+        self.bad: set[Path] = set()  # files that were reported
 
     def __call__(self, rng: Rng) -> Tensor:
         """A random photo [H, W, 3] sRGB; InputError if `TRIES` in a row cannot be read."""
@@ -139,22 +160,24 @@ class PhotoDraw:
 
 @dataclasses.dataclass(frozen=True)
 class SyntheticScenes:
-    """A folder of synthetic scenes, numbered from 0; number, seed, size and photos determine a
-    scene.
+    """A folder of synthetic scenes, numbered from 0.
+
+    A scene is determined by its number, and by seed, size and photos.
     """
 
     folder: Path
-    photos: Sequence[Path]
+    photos: Sequence[Path]  # from which textures are cut
     size: tuple[int, int]  # height and width; swapped for upright scenes
     seed: int
-    count: int
+    count: int  # of scenes
 
     def fill(self, progress: Callable[[int, int], None], warn: Warn) -> None:
-        """Make missing scenes. Damaged files are reported and replaced; too short files are
-        replaced silently.
+        """Make the scenes that are missing.
+
+        Damaged files are reported and replaced; too short files are replaced silently.
 
         Args:
-            progress: called with the number of scenes that exist.
+            progress: called with the number of scenes that exist, and of all.
             warn: called with a message about each skipped photo and replaced file.
 
         Raises:
@@ -163,19 +186,19 @@ class SyntheticScenes:
         self.folder.mkdir(parents=True, exist_ok=True)
         draw = PhotoDraw(self.photos, warn)
         for first in range(0, self.count, PER_FILE):
-            last = min(first + PER_FILE, self.count)
-            if self._stored(first, warn) < last - first:
-                self._write(first, last, draw, progress)
-            progress(last, self.count)
+            end = min(first + PER_FILE, self.count)
+            if self._stored(first, warn) < end - first:
+                self._write(first, end, draw, progress)
+            progress(end, self.count)
 
     def frame(self, index: int) -> Frame:
         """Read a scene; InputError if its file is missing or damaged."""
-        path, row = self._file(index), index % PER_FILE
+        path = self._file(index)
+        row = index % PER_FILE
         try:
             with safe_open(path, framework="pt") as file:
-                rgb, inverse_depth = (
-                    file.get_slice(name)[row] for name in ("rgb", "inverse_depth")
-                )
+                rgb = file.get_slice("rgb")[row]
+                inverse_depth = file.get_slice("inverse_depth")[row]
                 upright = bool(file.get_tensor("upright")[row])
         except (OSError, SafetensorError, IndexError) as error:
             raise InputError(
@@ -187,10 +210,11 @@ class SyntheticScenes:
         return Frame(rgb, inverse_depth, torch.ones_like(inverse_depth, dtype=torch.bool))
 
     def _file(self, index: int) -> Path:
+        """The file that has the scene with this number."""
         return self.folder / f"{index // PER_FILE:04d}.safetensors"
 
     def _stored(self, first: int, warn: Warn) -> int:
-        """The number of complete scenes in a scene's file."""
+        """How many scenes the file of scene number `first` holds; 0 if it is missing or damaged."""
         path = self._file(first)
         pixels = self.size[0] * self.size[1]
         try:
@@ -209,27 +233,31 @@ class SyntheticScenes:
         return 0
 
     def _write(
-        self, first: int, last: int, draw: PhotoDraw, progress: Callable[[int, int], None]
+        self, first: int, end: int, draw: PhotoDraw, progress: Callable[[int, int], None]
     ) -> None:
+        """Make the file of the scenes `first` to `end` − 1."""
         scenes = []
-        for index in range(first, last):
+        for index in range(first, end):
             scenes.append(self._scene(index, draw))
             progress(index + 1, self.count)
-        names = ("rgb", "inverse_depth", "upright")
+        rgbs, inverse_depths, uprights = zip(*scenes, strict=True)
         tensors = {
-            name: torch.stack(rows)
-            for name, rows in zip(names, zip(*scenes, strict=True), strict=True)
+            "rgb": torch.stack(rgbs),
+            "inverse_depth": torch.stack(inverse_depths),
+            "upright": torch.stack(uprights),
         }
         with atomic_path(self._file(first)) as temporary:
             temporary.write_bytes(save(tensors))
 
     def _scene(self, index: int, draw: PhotoDraw) -> tuple[Tensor, Tensor, Tensor]:
-        """A scene as it is stored: flattened, with 8-bit colours and depth in half precision."""
+        """A scene as it is stored: colours, inverse depth, and whether it is upright.
+
+        Colours [H · W · 3] have 8 bits, and inverse depths [H · W] half precision.
+        """
         rng = np.random.default_rng([self.seed, index])
         upright = rng.random() >= 1 - UPRIGHT
-        rgb, inverse_depth = synthetic_scene(
-            rng, draw, *(self.size[::-1] if upright else self.size)
-        )
+        height, width = self.size[::-1] if upright else self.size
+        rgb, inverse_depth = synthetic_scene(rng, draw, height, width)
         return (
             (rgb * 255 + 0.5).to(torch.uint8).flatten(),
             inverse_depth.half().flatten(),

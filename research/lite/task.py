@@ -1,10 +1,7 @@
-"""The lite base's task for the training loop: a network learns depth from synthetic and measured
-pictures.
-"""
+"""The lite base's task for the training loop: a network learns depth from pictures with depth."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -38,12 +35,18 @@ VIRIDIS = torch.tensor(
 ) / 255  # fmt: skip
 UNKNOWN = 0.2  # grey of pixels without a value
 ENDS = (0.02, 0.98)  # quantiles that get the first and the last colour
+GROUP_MEASURES = ("abs_rel", "delta")  # the measures that are also reported of each group
 
 
 def colored(values: Tensor, low: float, high: float, known: Tensor | None = None) -> Tensor:
-    """[H, W, 3] sRGB of values [H, W]; values up to `low` get the first colour, values from `high`
-    the last colour.
+    """[H, W, 3] sRGB: values as colours from dark blue to yellow.
+
+    Args:
+        values: [H, W].
+        low, high: values up to `low` get the first colour, those from `high` on the last one.
+        known: [H, W] bool: all other pixels get grey; None: all are known.
     """
+    # In the list of colours: 1.3 is 30 % of the way from the second colour to the third.
     place = ((values - low) / max(high - low, 1e-12)).clamp(0, 1) * (len(VIRIDIS) - 1)
     below = place.long().clamp_max(len(VIRIDIS) - 2)
     colors = torch.lerp(VIRIDIS[below], VIRIDIS[below + 1], (place - below)[..., None])
@@ -63,92 +66,143 @@ class LiteTask(Task):
     selection_measure: ClassVar[str] = "abs_rel"
 
     def __init__(self, recipe: LiteRecipe, device: torch.device) -> None:
-        """Find a recipe's files, without making scenes or reading frames; InputError if they cannot
-        be used.
+        """Find a recipe's files, without making scenes or reading frames.
+
+        InputError if they cannot be used.
         """
-        self.recipe, self.device, self.files = recipe, device, LiteFiles.of(recipe.data)
+        self.recipe = recipe
+        self.device = device
+        self.files = LiteFiles.of(recipe.data)
         self.network: nn.Module = freeze(first_network(recipe), recipe.optim.frozen)
         self.digest = self.files.digest
-        self.items = self.items_per_step = recipe.optim.batch
+        # Batches are drawn at random, without end: a step uses all items there are.
+        self.items = recipe.optim.batch
+        self.items_per_step = recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Make missing scenes and guesses, and read the frames."""
-        recipe, files, log, shares = self.recipe, self.files, reporter.log, self.recipe.data.shares
-        cache = recipe.data.cache or output / CACHE
-        sources: list[tuple[Source, float]] = []
+        """Make missing scenes and guesses, and read the frames.
 
-        def make(what: str, folder: Path, fill: Callable[[Progress, Warn], None]) -> None:
-            """Make files in the first process; all other processes wait for the files."""
-            if rank() == 0:
-                make_folder(folder)
-                log(f"{what} in {folder}")
-                with reporter.stage(what.split(" ", 1)[1]) as step:
-                    fill(step, log)
-            wait_for_ranks()
+        Args:
+            output: the run's folder; scenes and guesses lie in its subfolder unless the recipe
+                names a cache.
+            reporter: shows progress.
 
-        if files.photos:
-            data, folder = recipe.data, cache / f"lite-{files.scenes_digest}"
-            scenes = SyntheticScenes(folder, files.photos, data.size, data.seed, data.made)
-            make(f"{data.made} synthetic scenes", folder, scenes.fill)
-            sources.append((Drawn(scenes), shares.made))
-        for measured, share in ((files.stereo, shares.stereo), (files.rgbd, shares.rgbd)):
-            if measured:
-                sources.append((Kept(read_all(measured, LEARNED_SIDE, log)), share))
-        if files.guessed:
-            folder = cache / f"guesses-{files.guesses_digest}"
-            guesses, teacher = GuessedPhotos(folder, files.guessed), recipe.data.teacher
-            device = str(self.device)
-            make(
-                f"{len(files.guessed)} guesses",
-                folder,
-                lambda step, warn: guesses.fill(LiteBase.load(teacher, device=device), step, warn),
-            )
-            sources.append((guesses, shares.guessed))
-        if files.worlds:
-            sources.append((Rooms(files.worlds), shares.worlds))
+        Returns:
+            What the run's summary says of its data.
+        """
+        recipe = self.recipe
+        files = self.files
+        log = reporter.log
+        sources = self._training_sources(recipe.data.cache or output / CACHE, reporter)
         self.groups_of_frames = {
             group.name: [frame for _, frame in read_all(group.files, JUDGED_SIDE, log)]
             for group in files.groups
         }
+
+        # How many frames there are of each source, and of each validation group.
         counts = {
             "made": recipe.data.made if files.photos else 0,
             "stereo": len(files.stereo),
             "rgbd": len(files.rgbd),
         }
-        counts |= {"guessed": len(files.guessed)} if files.guessed else {}
-        counts |= {"room views": len(files.worlds)} if files.worlds else {}
-        judged = {name: len(frames) for name, frames in self.groups_of_frames.items()}
-        log(f"to learn from: {_listed(counts)}; to be judged by: {_listed(judged)}")
+        if files.photos_to_guess:
+            counts["guessed"] = len(files.photos_to_guess)
+        if files.worlds:
+            counts["room views"] = len(files.worlds)
+        group_counts = {name: len(frames) for name, frames in self.groups_of_frames.items()}
+        log(f"to learn from: {_listed(counts)}; to be judged by: {_listed(group_counts)}")
 
         height, width = recipe.data.size
         precision = pick_dtype(recipe.optim.precision, self.device)
         self.judge = DepthJudge(recipe.loss, height * width, precision, self.device)
-        each, parts = zip(*sources, strict=True)
-        self.mixture = Mixture(each, parts, recipe.data.size, recipe.run.seed, recipe.data.scales)
-        self.validation_items = len(judged)
-        self.measures = (
-            *MEASURES,
-            *(f"{group}/{name}" for group in judged for name in ("abs_rel", "delta")),
+        self.mixture = Mixture(
+            [source for source, _ in sources],
+            [share for _, share in sources],
+            recipe.data.size,
+            recipe.run.seed,
+            recipe.data.scales,
         )
-        return {"samples": {"train": counts, "validation": judged, "digest": self.digest}}
+        self.validation_items = len(group_counts)
+        of_groups = [f"{group}/{name}" for group in group_counts for name in GROUP_MEASURES]
+        self.measures = (*MEASURES, *of_groups)
+        return {"samples": {"train": counts, "validation": group_counts, "digest": self.digest}}
+
+    def _training_sources(self, cache: Path, reporter: Reporter) -> list[tuple[Source, float]]:
+        """All sources of training frames, with their relative shares; missing files are made.
+
+        Args:
+            cache: gets a folder of synthetic scenes and one of guesses.
+            reporter: shows progress.
+        """
+        data = self.recipe.data
+        files = self.files
+        log = reporter.log
+
+        def make(
+            count: int, what: str, folder: Path, fill: Callable[[Progress, Warn], None]
+        ) -> None:
+            """Make files in the first process; all other processes wait for the files."""
+            if rank() == 0:
+                make_folder(folder)
+                log(f"{count} {what} in {folder}")
+                with reporter.stage(what) as progress:
+                    fill(progress, log)
+            wait_for_ranks()
+
+        sources: list[tuple[Source, float]] = []
+        if files.photos:
+            folder = cache / f"lite-{files.scenes_digest}"
+            scenes = SyntheticScenes(folder, files.photos, data.size, data.seed, data.made)
+            make(data.made, "synthetic scenes", folder, scenes.fill)
+            sources.append((Drawn(scenes), data.shares.made))
+        if files.stereo:
+            sources.append((Kept(read_all(files.stereo, LEARNED_SIDE, log)), data.shares.stereo))
+        if files.rgbd:
+            sources.append((Kept(read_all(files.rgbd, LEARNED_SIDE, log)), data.shares.rgbd))
+        if files.photos_to_guess:
+            folder = cache / f"guesses-{files.guesses_digest}"
+            guesses = GuessedPhotos(folder, files.photos_to_guess)
+
+            def fill_guesses(progress: Progress, warn: Warn) -> None:
+                """Make missing guesses; the teacher is loaded only in the process that does so."""
+                teacher = LiteBase.load(data.teacher, device=str(self.device))
+                guesses.fill(teacher, progress, warn)
+
+            make(len(files.photos_to_guess), "guesses", folder, fill_guesses)
+            sources.append((guesses, data.shares.guessed))
+        if files.worlds:
+            sources.append((Rooms(files.worlds), data.shares.worlds))
+        return sources
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """One group of weights for each rate: the pretrained encoder has its own."""
-        found: dict[float, list[Tensor]] = {}
+        """Groups of weights for the optimiser, one for each factor on the learning rate.
+
+        The pretrained encoder has a factor of its own; frozen weights are in no group.
+        """
+        weights_by_factor: dict[float, list[Tensor]] = {}
         for name, weight in self.network.named_parameters():
             if weight.requires_grad:
-                scale = self.recipe.optim.encoder_rate if name.startswith("encoder.") else 1.0
-                found.setdefault(scale, []).append(weight)
-        return [{"params": weights, "lr_scale": scale} for scale, weights in found.items()]
+                factor = self.recipe.optim.encoder_rate if name.startswith("encoder.") else 1.0
+                weights_by_factor.setdefault(factor, []).append(weight)
+        return [
+            {"params": weights, "lr_scale": factor} for factor, weights in weights_by_factor.items()
+        ]
 
     def load_batch(
         self, step: int | None, items: Sequence[int]
     ) -> DepthBatch | list[tuple[str, list[Frame]]]:
-        """A step's pictures, or groups of validation frames by name; InputError if a file cannot be
-        read.
+        """A step's pictures, or groups of validation frames with their names.
+
+        Args:
+            step: number of the training step; None: validation.
+            items: indices in the step's batch, or of validation groups.
+
+        Raises:
+            InputError: a file cannot be read.
         """
         if step is None:
-            return [list(self.groups_of_frames.items())[item] for item in items]
+            groups = list(self.groups_of_frames.items())
+            return [groups[item] for item in items]
         return self.mixture.batch(step, items)
 
     def loss(self, network: nn.Module, batch: DepthBatch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -158,35 +212,46 @@ class LiteTask(Task):
     def measure(
         self, network: nn.Module, batch: Sequence[tuple[str, list[Frame]]]
     ) -> dict[str, list[float]]:
-        """`MEASURES` of groups, and scores of each group by its name."""
-        found: dict[str, list[float]] = {name: [] for name in MEASURES}
+        """Measure a network on groups of validation frames.
+
+        Args:
+            network: the network.
+            batch: the groups: their names, and their frames.
+
+        Returns:
+            For each name in MEASURES a list, with the mean over the frames of each group. Also, to
+            show how each group fares, its main scores: "NAME/abs_rel" and "NAME/delta", with the
+            group's name, are lists of one value.
+        """
+        values: dict[str, list[float]] = {name: [] for name in MEASURES}
         for group, frames in batch:
-            each = [self.judge.measure(network, frame) for frame in frames]
-            means = {name: sum(one[name] for one in each) / len(each) for name in MEASURES}
-            for name, mean in means.items():
-                found[name].append(mean)
-            found |= {f"{group}/{name}": [means[name]] for name in ("abs_rel", "delta")}
-        return found
+            frame_scores = [self.judge.measure(network, frame) for frame in frames]
+            for name in MEASURES:
+                mean = sum(scores[name] for scores in frame_scores) / len(frame_scores)
+                values[name].append(mean)
+                if name in GROUP_MEASURES:
+                    values[f"{group}/{name}"] = [mean]
+        return values
 
     @torch.no_grad()
     def draw_picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: for a few validation frames the photo, and predicted and true inverse
-        depth.
+        """[H, W, 3] sRGB: photos of a few validation frames, with two pictures beside each.
+
+        These are the predicted and the true inverse depth.
         """
-        each, rows = max(1, MAX_PICTURED_ITEMS // self.validation_items), []
-        chosen = [
-            group[:: max(1, len(group) // each)][:each] for group in self.groups_of_frames.values()
-        ]
-        for frame in itertools.chain(*chosen):
-            predicted, true = self.judge.predict(network, frame), frame.inverse_depth
-            guess = colored(predicted, *ends(predicted[frame.valid]))
-            rows.append(
-                [
-                    frame.rgb.permute(1, 2, 0),
-                    guess,
-                    colored(true, *ends(true[frame.valid]), frame.valid),
-                ]
-            )
+        per_group = max(1, MAX_PICTURED_ITEMS // self.validation_items)
+        rows = []
+        for group in self.groups_of_frames.values():
+            step = max(1, len(group) // per_group)  # frames are evenly spaced in their group
+            for frame in group[::step][:per_group]:
+                photo = frame.rgb.permute(1, 2, 0)
+                predicted = self.judge.predict(network, frame)
+                low, high = ends(predicted[frame.valid])
+                predicted_picture = colored(predicted, low, high)
+                true = frame.inverse_depth
+                low, high = ends(true[frame.valid])
+                true_picture = colored(true, low, high, frame.valid)
+                rows.append([photo, predicted_picture, true_picture])
         return contact_sheet(rows, PICTURE_SIDE_PX)
 
     def export(self, network: nn.Module, path: Path) -> None:
@@ -195,4 +260,5 @@ class LiteTask(Task):
 
 
 def _listed(counts: Mapping[str, int]) -> str:
+    """Counts with their names in a line: "40 made, 2 stereo"."""
     return ", ".join(f"{count} {name}" for name, count in counts.items())

@@ -204,9 +204,11 @@ def test_another_teacher_is_another_run_wherever_it_lies(place: Path, tmp_path: 
     )
     assert one.digest == same.digest
     assert len({files.digest for files in (none, one, two)}) == 3
-    assert (len(none.guessed), len(one.guessed)) == (0, 3)
+    assert (len(none.photos_to_guess), len(one.photos_to_guess)) == (0, 3)
     fewer = LiteFiles.of(data.model_copy(update={"teacher": tmp_path / "one", "guesses": 2}))
-    assert [file.name for file in fewer.guessed] == [one.guessed[0].name, one.guessed[1].name]
+    assert [photo.name for photo in fewer.photos_to_guess] == [
+        photo.name for photo in one.photos_to_guess[:2]
+    ]
     assert len(fewer.photos) == 3
 
 
