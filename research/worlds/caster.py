@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 MISS = -1
 GLASS_OPACITY = 0.6  # a material below it is looked through
-GLASS_PASS = 0.88  # share of light that passes a pane
+GLASS_PASS = 0.88  # share of light that a pane lets through
 MAX_LAYERS = 10  # of leaves or panes that a ray passes
 NUDGE_M = 3e-4  # how far from a surface a ray continues
 FAR_M = 1e9
@@ -32,7 +32,7 @@ class Hits:
     distance: Floats  # [N] in units of the ray's direction, inf for none
     u: Floats  # [N] barycentric weight of the second corner
     v: Floats  # [N] and of the third
-    passed: Floats  # [N] share of light that panes in front let through, 1 without panes
+    transmittance: Floats  # [N] share of light that panes before the surface let through; 1: none
 
     def select(self, indices: NDArray[np.int64]) -> Hits:
         """Those with these indices [M]."""
@@ -41,19 +41,24 @@ class Hits:
             self.distance[indices],
             self.u[indices],
             self.v[indices],
-            self.passed[indices],
+            self.transmittance[indices],
         )
 
 
 class World:
     """The triangles of a world, ready to be hit and shaded."""
 
-    def __init__(self, mesh: Mesh, made: dict[str, NDArray[np.uint8]]) -> None:
-        """Build the search trees; `made` has the pictures that are not files, by name."""
+    def __init__(self, mesh: Mesh, pictures: dict[str, NDArray[np.uint8]]) -> None:
+        """Build the search trees.
+
+        Args:
+            mesh: all triangles.
+            pictures: textures that are no files, by the name that materials give.
+        """
         self.mesh = mesh
         materials = mesh.materials
         names = sorted({one.texture for one in materials if one.texture is not None})
-        self.pyramids: Pyramids = pyramids(find_pictures(names, made))
+        self.pyramids: Pyramids = pyramids(find_pictures(names, pictures))
 
         # Arrays with an entry for each of the M materials, which compiled code can read.
         numbers = {name: number for number, name in enumerate(names)}
@@ -88,7 +93,6 @@ class World:
 
         # Sheer surfaces in front of the solid one are looked at one after the other, until one
         # stops the ray.
-        passed = hits.passed
         start = np.zeros(len(origins), np.float32)  # [N] the distance from which a ray goes on
         going = np.arange(len(origins))  # indices of the rays that go on
         for _ in range(MAX_LAYERS):
@@ -112,7 +116,7 @@ class World:
             hits.distance[here] = distance[nearer][stops]
             hits.u[here] = u[stops]
             hits.v[here] = v[stops]
-            passed[going[glass]] *= GLASS_PASS
+            hits.transmittance[going[glass]] *= GLASS_PASS
 
             # The other rays go on a little behind the surface.
             start[going] = distance[nearer] + NUDGE_M

@@ -67,9 +67,9 @@ def model_picture(library: Library, model: Model, side: int) -> NDArray[np.uint8
 
     pixel_m = np.full(len(origins), 2 * radius / side, np.float32)
     is_model = hits.triangle[:, None] >= 0
-    through_glass = hits.passed[:, None]  # share of light that panes before the surface let through
-    colors = world.albedo(hits, pixel_m) * light * through_glass
-    colors = np.where(is_model, colors, BACKGROUND * through_glass)
+    transmittance = hits.transmittance[:, None]  # of panes before the surface
+    colors = world.albedo(hits, pixel_m) * light * transmittance
+    colors = np.where(is_model, colors, BACKGROUND * transmittance)
     return (linear_to_srgb(colors) * 255).astype(np.uint8).reshape(side, side, 3)
 
 

@@ -161,7 +161,7 @@ def _view_of_rays(
     rotation = camera.world_to_camera[:3, :3].numpy() @ viewpoint.axes
     normal = (middle.smooth @ rotation.T).astype(np.float32)
     valid = np.where(found, VALID, FAR).astype(np.uint8)
-    valid[(middle.hits.passed < 1) & found] = UNSURE
+    valid[(middle.hits.transmittance < 1) & found] = UNSURE
     # A ray has depth one, so distances along it are depths.
     return View(
         camera,
@@ -201,7 +201,7 @@ def _edges(middle: _Traced, sunlit: Floats, shape: tuple[int, int]) -> Bools:
     normal = middle.flat.reshape(*shape, 3)
     position = middle.positions.reshape(*shape, 3)
     lit = sunlit.reshape(shape) > 0
-    glass = middle.hits.passed.reshape(shape)
+    glass = middle.hits.transmittance.reshape(shape)
     edges = np.zeros(shape, bool)
     # Each pixel is compared with the one below it, then with the one to its right.
     for axis in (0, 1):
@@ -276,8 +276,8 @@ def _shaded(
             shaded = shaded * clear + (1 - clear) * lights.haze_color
         colors[found] = shaded
     # Panes darken what is behind them, and mirror some of the room.
-    pane = 1 - hits.passed
-    colors = colors * hits.passed[:, None] + pane[:, None] * GLASS_SHINE * irradiance.mean / np.pi
+    transmittance = hits.transmittance[:, None]  # [N, 1] of the panes
+    colors = colors * transmittance + (1 - transmittance) * GLASS_SHINE * irradiance.mean / np.pi
     return colors.astype(np.float32), sunlit
 
 

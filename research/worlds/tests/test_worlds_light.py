@@ -59,7 +59,7 @@ def test_rays_pass_holes_of_a_leaf_and_panes_of_glass() -> None:
     down = np.repeat(-UP, 3, 0)
     hits = world.first_hits(origins, down)
     np.testing.assert_allclose(hits.distance, [2, 1, 2], rtol=1e-5)
-    np.testing.assert_array_equal(hits.passed < 1, [False, False, True])
+    np.testing.assert_array_equal(hits.transmittance < 1, [False, False, True])
     blocked = world.blocked(origins, down, np.full(3, 1.9, np.float32))
     np.testing.assert_array_equal(blocked, [False, True, False])
 
