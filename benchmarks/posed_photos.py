@@ -43,7 +43,7 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.bases.settings import BaseSettings
-from spackle.cli.script_command import run_script
+from spackle.cli.script_command import check_picture_file, run_script
 from spackle.core.camera import Camera
 from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
@@ -176,9 +176,10 @@ def main() -> None:
     for choice in options.choices:
         if CHOICE.fullmatch(choice) is None:
             raise InputError(f"--choices {choice}: choose spread, near or random-N")
-    for file in (options.output, options.json):
-        if file is not None:
-            check_writable(file)
+    if options.output is not None:
+        check_picture_file(options.output)
+    if options.json is not None:
+        check_writable(options.json)
     features = None
     if options.features is not None:
         features = load_features("squeezenet", options.features, torch.device("cpu"))

@@ -33,7 +33,7 @@ from torch import Tensor
 import spackle
 from spackle import Camera, Gaussians
 from spackle.bases.depth import lift_rgbd
-from spackle.cli.script_command import run_script
+from spackle.cli.script_command import check_picture_file, run_script
 from spackle.core.filters import maximum_filter
 from spackle.depth.depth_map import DepthMap
 from spackle.inpaint import InpainterOptions, get_inpainter, known_inverse_depth
@@ -179,9 +179,10 @@ def main() -> None:
     for scene in (*words.only, words.figure_scene):
         if scene not in rendered_scenes.SCENES:
             raise InputError(f"scene {scene} is {unknown_name(scene, [*rendered_scenes.SCENES])}")
-    for file in (words.output, words.figure):
-        if file is not None:
-            check_writable(file)
+    if words.output is not None:
+        check_writable(words.output)
+    if words.figure is not None:
+        check_picture_file(words.figure)
     features = None
     if words.features is not None:
         features = load_features("squeezenet", words.features)

@@ -64,7 +64,7 @@ import spackle
 from spackle import Camera, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.depth import lift_rgbd
 from spackle.bases.lite import MAX_DEPTH_RATIO
-from spackle.cli.script_command import run_script
+from spackle.cli.script_command import check_picture_file, run_script
 from spackle.core.filters import maximum_filter
 from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.photo import load_photo, resize_photo
@@ -515,11 +515,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = [DEFAULT, *(MECHANISMS if chosen.ledger else ()), *chosen.without]
     for name in {part for run in names[1:] for part in run.split("+")} - {*MECHANISMS}:
         parser.error(f"--without {name!r}: choose of {', '.join(MECHANISMS)}")
+    if chosen.photos:
+        output = chosen.output or Path("sheet.jpg")
+        check_picture_file(output)
+        sheet(chosen.photos, names).save(output)
+        return
     if chosen.output is not None:
         check_writable(chosen.output)
-    if chosen.photos:
-        sheet(chosen.photos, names).save(chosen.output or "sheet.jpg")
-        return
     folder = chosen.folder or Path()
     folders = [path.parent for path in sorted(folder.glob("*/scene.json"))] or pictures_in(
         folder, CUT_PHOTOS

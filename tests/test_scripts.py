@@ -44,6 +44,7 @@ COMMANDS = {
         "empty --features missing",
         "empty --choices unknown",
         "empty -o missing/sheet.jpg",
+        "empty -o sheet.xyz",
         "empty --json missing/numbers.json",
     ),
     "benchmarks/posed_scenes.py": ("still_life damaged/out",),
@@ -58,6 +59,7 @@ COMMANDS = {
         "--figure-scene unknown",
         "-o missing/removal.md",
         "--figure missing/removal.jpg",
+        "--figure removal.md",
     ),
     "benchmarks/rendered_scenes.py": ("-o damaged/out",),
     "benchmarks/reproduce.py": ("-o damaged/out", "--features missing", "--features damaged"),
@@ -80,6 +82,7 @@ COMMANDS = {
         "--photos missing",
         "--photos empty",
         "--photos photos -o missing/sheet.jpg",
+        "--photos photos -o sheet.json",
     ),
     "benchmarks/serve.py": ("-o missing/results.json", "--photos 0"),
     "benchmarks/sharp.py": (
@@ -133,6 +136,7 @@ COMMANDS = {
         "-o sheet.png damaged",
         "-o sheet.png worlds",
         "empty -o missing/sheet.png",
+        "empty -o sheet",
     ),
 }
 

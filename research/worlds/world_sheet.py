@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from spackle.cli.script_command import run_script
+from spackle.cli.script_command import check_picture_file, run_script
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import check_writable
 from worlds.shards import ROOMS_PREFIX, StoredView, read_view, world_keys
 
 Bytes = NDArray[np.uint8]
@@ -101,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--prefix", default=ROOMS_PREFIX, help="how archives' names begin: worlds, streets, tracks"
     )
     options = parser.parse_args(arguments)
-    check_writable(options.output)
+    check_picture_file(options.output)
     picture = sheet(options.folder, options.count, options.views, options.first, options.prefix)
     Image.fromarray(picture).save(options.output)
 

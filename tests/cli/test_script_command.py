@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
 
-from spackle.cli.script_command import run_script
+from spackle.cli.script_command import check_picture_file, run_script
 from spackle.runtime.errors import InputError
 
 
@@ -54,3 +55,12 @@ def test_a_file_that_the_system_refuses_is_named(
 def test_a_fault_of_the_script_keeps_its_traceback() -> None:
     with pytest.raises(ZeroDivisionError):
         run_script(lambda: 1 // 0)
+
+
+def test_a_picture_file_has_a_name_that_pillow_can_write(tmp_path: Path) -> None:
+    for name in ("a.png", "a.JPG", "a.tif", "a.webp"):
+        check_picture_file(tmp_path / name)
+    # Pillow reads .psd, but does not write it.
+    for name in ("a", "a.psd", "a.json", "missing/a.png"):
+        with pytest.raises(InputError, match=rf"^{re.escape(str(tmp_path / name))}: "):
+            check_picture_file(tmp_path / name)

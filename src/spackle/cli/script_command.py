@@ -1,17 +1,21 @@
-"""How the scripts of research/ and benchmarks/ end, which begin by `python FILE`.
+"""What the scripts of research/ and benchmarks/ share, which begin by `python FILE`.
 
-The command `spackle` ends in the same way, see `spackle.cli.main`.
+They end in the same way as the command `spackle`, see `spackle.cli.main`.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from spackle.cli.messages import with_flags
 from spackle.cli.options import BAD_INPUT, INTERRUPTED
 from spackle.cli.system_errors import problem_of_system
-from spackle.runtime.errors import InputError, printable_line
+from spackle.runtime.errors import InputError, printable_line, unknown_suffix
+from spackle.runtime.files import check_writable
+
+USUAL_PICTURES = (".png", ".jpg", ".webp")  # of all suffixes of pictures, those to advise
 
 
 def run_script(main: Callable[[], int | None]) -> int:
@@ -39,3 +43,17 @@ def run_script(main: Callable[[], int | None]) -> int:
     if message:
         print(f"error: {with_flags(printable_line(message))}", file=sys.stderr)
     return BAD_INPUT
+
+
+def check_picture_file(path: Path) -> None:
+    """Check, before long work, that Pillow can write a picture to a path.
+
+    Raises:
+        InputError: `check_writable` refuses the path, or its suffix is no picture's.
+    """
+    from PIL import Image  # the help need not wait for it
+
+    check_writable(path)
+    picture_format = Image.registered_extensions().get(path.suffix.lower())
+    if picture_format not in Image.SAVE:
+        raise unknown_suffix(path, "not a name for a picture", USUAL_PICTURES)
