@@ -1,5 +1,5 @@
-"""The scripts that rebuild the shipped weights, in miniature: from data to a file that the package
-loads.
+"""The script that rebuilds the shipped weights of lite, in miniature: from data to a file that the
+package loads. That of the residual: research/worlds/tests/test_worlds_rebuild.py.
 """
 
 from __future__ import annotations
@@ -11,12 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.photos import write_photo
-from safetensors.torch import load_file
 
 from spackle.bases.lite import SHIPPED_WEIGHTS as LITE
 from spackle.bases.lite import load_networks
-from spackle.residual.architectures import SHIPPED, load_residual
 
 pytestmark = pytest.mark.slow
 RESEARCH = Path(__file__).parents[1] / "research"
@@ -34,33 +31,6 @@ def rebuild(script: str, output: Path, *overrides: str) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200, env=environment)
     assert done.returncode == 0, done.stderr
-
-
-def test_the_residual_is_rebuilt(tmp_path: Path) -> None:
-    for index in range(3):
-        write_photo(tmp_path / "photos" / f"{index}.png", 96 + 16 * index, 80)
-    small = [
-        "data.views=4",
-        "data.validation_views=1",
-        "data.cells=16",
-        "data.stereo=null",
-        "data.rgbd=[]",
-    ]
-    out = tmp_path / "out"
-    rebuild(
-        "rebuild_residual.py", out, f"data.photos={tmp_path}/photos", "loss.features=none", *small
-    )
-    made, shipped = load_file(out / "residual.safetensors"), load_file(SHIPPED)
-    assert {name: (x.shape, x.dtype) for name, x in made.items()} == {
-        name: (x.shape, x.dtype) for name, x in shipped.items()
-    }
-    assert load_residual(out / "residual.safetensors").name == "unet"
-    parts = [
-        load_file(out / name)["stem.weight"]
-        for name in ("mixed.safetensors", "third/best.safetensors", "fourth/best.safetensors")
-    ]
-    expected = 0.1 * parts[0] + 0.4 * parts[1] + 0.5 * parts[2]
-    assert float((made["stem.weight"].float() - expected).abs().max()) < 1e-3
 
 
 def test_lite_is_rebuilt(tmp_path: Path) -> None:

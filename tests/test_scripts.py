@@ -114,7 +114,12 @@ COMMANDS = {
     ),
     "research/lite/rebuild.py": ("-o damaged/out", "-o out data.photos=missing"),
     "research/lite/train.py": ("-o out --recipe missing", "-o out --recipe damaged"),
-    "research/rebuild_residual.py": ("-o damaged/out",),
+    "research/rebuild_open.py": (
+        "--features photo.png --photos photos --office photos -o damaged/out",
+        "-o out --features photo.png --office photos --photos missing",
+        "-o out --features photo.png --photos photos --office missing",
+        "-o out --photos photos --office photos --features missing",
+    ),
     "research/worlds/fetch.py": ("--cache damaged/cache",),
     "research/worlds/judge_residual.py": (
         "--features missing2 missing",
@@ -126,7 +131,12 @@ COMMANDS = {
         "initial --features missing2 --worlds empty",
         "initial --features missing2 --pairs pairs --sheet missing/sheet.png",
     ),
-    "research/worlds/make.py": ("-o out --photos missing", "-o out --photos empty"),
+    "research/worlds/make.py": (
+        "-o out --photos missing",
+        "-o out --photos empty",
+        "-o out --part 3/2",
+        "-o out --part x",
+    ),
     "research/worlds/model_sheet.py": ("-o damaged/out",),
     "research/worlds/torcs.py": ("--cache damaged/cache",),
     "research/worlds/train_residual.py": ("-o out --recipe missing",),
@@ -198,8 +208,7 @@ def test_bad_input_is_one_line_that_names_it(
     assert words.split()[-1].rpartition("=")[2] in line
 
 
-# `worlds.make` leaves Ctrl-C to Python, which prints a traceback.
-@pytest.mark.parametrize("script", sorted({*SCRIPTS} - {"research/worlds/make.py"}))
+@pytest.mark.parametrize("script", sorted(SCRIPTS))
 def test_ctrl_c_ends_a_script_without_a_traceback(
     script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

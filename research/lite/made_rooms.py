@@ -24,7 +24,7 @@ from spackle.runtime.errors import as_input_error
 
 # How the names of archives begin: rooms and streets. Those of tracks, `tracks-`, are passed over,
 # because the terms of their models ask that what is made of them is shared alike.
-ARCHIVES = ("worlds-", "streets-")
+ARCHIVES = ("worlds-", "closeups-", "streets-")
 SURFACE, SKY = 1, 2  # values of the validity picture; 0: seen through glass
 
 

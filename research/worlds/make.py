@@ -3,9 +3,10 @@
     PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 1000 --photos PHOTOS
     PYTHONPATH=src:research python -m worlds.make -o OUT --worlds 500 --kind streets
 
-The names of archives with streets and gardens begin with `streets-`, those with tracks with
-`tracks-`. Rooms and streets are made of the first set of models, which `worlds.fetch` gets; tracks
-of the second set, which `worlds.torcs` gets and whose terms are others; see README.md.
+The names of archives with streets and gardens begin with `streets-`, those with rooms seen from
+close to a thing with `closeups-`, those with tracks with `tracks-`. Tracks are made of the second
+set of models, which `worlds.torcs` gets and whose terms are others (README.md); all else is made of
+the first set, which `worlds.fetch` gets.
 
 A world depends on the seed, its number and the number of its views alone. `--views 1` makes the
 photo alone, which is all that depth is learned from: more worlds in the same time. The command goes
@@ -26,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from spackle.cli.script_command import run_script
 from spackle.core.image_formats import PHOTO_SUFFIXES
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import list_files
@@ -58,7 +60,7 @@ UPRIGHT = 0.25  # share of worlds whose photo is upright
 ATTEMPTS = 20  # how many rooms or places are tried until one shows enough
 VERSION = 2  # increases whenever the same seed gives other worlds
 # How the names of archives begin, by the kind of worlds in them.
-PREFIXES = {"rooms": ROOMS_PREFIX, "streets": "streets", "tracks": "tracks"}
+PREFIXES = {"rooms": ROOMS_PREFIX, "closeups": "closeups", "streets": "streets", "tracks": "tracks"}
 DrawPlan = Callable[[Rng], WorldPlan]  # gives a random room, street, garden or track
 
 
@@ -75,19 +77,29 @@ MakeWorld = Callable[[int], PackedWorld]  # makes the world of a number
 def photos_of(folder: Path | None) -> DrawPhoto | None:
     """A source of photos for picture frames and for what is behind windows; None without a folder.
 
+    Photos that cannot be read are named on standard error, once, and passed over.
+
     Raises:
-        InputError: the folder has no photos.
+        InputError: the folder has no photos; or, when one is drawn, none that can be read.
     """
     if folder is None:
         return None
     files = list_files(folder, tuple(PHOTO_SUFFIXES), below=True) if folder.is_dir() else []
+    none_left = InputError(f"{folder}: contains no photos: give another folder as --photos")
     if not files:
-        raise InputError(f"{folder}: contains no photos: give another folder as --photos")
+        raise none_left
 
     def draw(rng: Rng) -> NDArray[np.uint8]:
         """A random photo [H, W, 3]."""
-        with Image.open(files[int(rng.integers(len(files)))]) as photo:
-            return np.asarray(photo.convert("RGB"))
+        while files:
+            file = files[int(rng.integers(len(files)))]
+            try:
+                with Image.open(file) as photo:
+                    return np.asarray(photo.convert("RGB"))
+            except (OSError, ValueError, Image.DecompressionBombError):
+                print(f"passed over: {file}: not a photo, or damaged", file=sys.stderr)
+                files.remove(file)
+        raise none_left
 
     return draw
 
@@ -239,12 +251,12 @@ def _maker_of_kind(
         second_views: how many views a world has besides the photo's.
     """
     library = open_torcs(cache) if kind == "tracks" else open_library(cache)
-    furniture = Furniture(library) if kind == "rooms" else None
+    furniture = Furniture(library) if kind in ("rooms", "closeups") else None
 
     def draw(rng: Rng) -> WorldPlan:
         """A random world of the kind."""
         if furniture is not None:
-            return furnish(rng, furniture, cache, photo)
+            return furnish(rng, furniture, cache, photo, close=kind == "closeups")
         return track(rng, library) if kind == "tracks" else street_or_garden(rng, library, cache)
 
     return lambda number: make_world(draw, library, seed, number, second_views=second_views)
@@ -257,7 +269,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder for archives")
     parser.add_argument(
-        "--kind", choices=sorted(PREFIXES), default="rooms", help="of worlds; streets: and gardens"
+        "--kind",
+        choices=sorted(PREFIXES),
+        default="rooms",
+        help="of worlds; streets: and gardens; closeups: rooms from close to a thing",
     )
     parser.add_argument("--worlds", type=int, default=48, help="how many there shall be")
     parser.add_argument("--photos", type=Path, help="photos for frames and windows")
@@ -272,27 +287,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cache", type=Path, help="where models are kept")
     parser.add_argument("--part", default="1/1", help="1/2: the first of two processes")
     options = parser.parse_args(arguments)
-    try:
-        which, parts = (int(word) for word in options.part.split("/"))
-        cache = cache_folder(options.cache)
-        make = _maker_of_kind(
-            options.kind, cache, photos_of(options.photos), options.seed, options.views - 1
+    part = part_of(options.part)
+    cache = cache_folder(options.cache)
+    make = _maker_of_kind(
+        options.kind, cache, photos_of(options.photos), options.seed, options.views - 1
+    )
+    make_folder(options.output)
+    prefix = PREFIXES[options.kind]
+    with file_lock(options.output / f".{prefix}-{part[0] + 1}.lock"):
+        make_shards(
+            options.output,
+            make,
+            options.worlds,
+            part,
+            lambda line: print(line, flush=True),
+            prefix,
         )
-        make_folder(options.output)
-        with file_lock(options.output / f".{PREFIXES[options.kind]}-{which}.lock"):
-            make_shards(
-                options.output,
-                make,
-                options.worlds,
-                (which - 1, parts),
-                lambda line: print(line, flush=True),
-                PREFIXES[options.kind],
-            )
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 
+def part_of(text: str) -> tuple[int, int]:
+    """Which part of the work is meant, from 0, and how many parts there are: (0, 2) for "1/2".
+
+    Raises:
+        InputError: the text is no such pair of numbers.
+    """
+    words = text.split("/")
+    if len(words) == 2 and all(word.isdecimal() for word in words):
+        number, count = int(words[0]), int(words[1])
+        if 1 <= number <= count:
+            return number - 1, count
+    raise InputError(f"--part {text}: must be a number and a count, such as 1/2 and 2/2")
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(main))

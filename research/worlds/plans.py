@@ -26,6 +26,8 @@ class Setting:
 
 
 INDOORS = Setting(min_known=0.6, near_m=MIN_NEAR_M, balanced=(0.4, 0.95))
+# In rooms, but close to a thing.
+CLOSE = Setting(min_known=0.6, near_m=0.12, balanced=(0.4, 0.95))
 OUTDOORS = Setting(min_known=0.5, near_m=0.8, balanced=(0.05, 0.45))
 
 

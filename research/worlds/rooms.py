@@ -28,7 +28,7 @@ from worlds.furniture import Furniture
 from worlds.lights import Lights, direction_to_sun, made_sky
 from worlds.meshes import Material, Mesh, box, joined, quad, rotation_z
 from worlds.placing import WALLS, Box, Opening, Place, Placed, WallName
-from worlds.plans import INDOORS, WorldPlan
+from worlds.plans import CLOSE, INDOORS, WorldPlan
 from worlds.shell import (
     WALL_M,
     WHITE,
@@ -43,7 +43,7 @@ from worlds.shell import (
     window_frame,
 )
 from worlds.surfaces import Surface, surfaces
-from worlds.viewpoints import indoor_viewpoint
+from worlds.viewpoints import close_viewpoint, indoor_viewpoint
 from worlds.views import COARSE_M
 
 Rng = np.random.Generator
@@ -130,8 +130,18 @@ def _openings(rng: Rng, width: float, depth: float, height: float, small: bool) 
     return openings
 
 
-def furnish(rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None) -> WorldPlan:
-    """A furnished room with its light."""
+def furnish(
+    rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None, close: bool = False
+) -> WorldPlan:
+    """A furnished room with its light.
+
+    Args:
+        rng: draws all of it.
+        furniture: models by group.
+        cache: the folder in which drawn textures of surfaces are kept.
+        photo: gives photos for picture frames and windows; None: there are none.
+        close: whether it is photographed from close to a thing, not as a room.
+    """
     room = Builder(rng, furniture, cache, photo)
     # Things find their places first, because pictures and lamps depend on them.
     RULES[room.kind](room)
@@ -142,13 +152,14 @@ def furnish(rng: Rng, furniture: Furniture, cache: Path, photo: DrawPhoto | None
     for number, thing in enumerate(room.place.things):
         room.parts.append(_mesh_of(room, thing, number in room.lit))
     keys = sorted({thing.model.entry.key for thing in room.place.things})
+    draw_viewpoint = close_viewpoint if close else indoor_viewpoint
     return WorldPlan(
-        INDOORS,
+        CLOSE if close else INDOORS,
         kind=room.kind,
         mesh=joined(room.parts),
         pictures=room.pictures,
         lights=lights,
-        draw_viewpoint=functools.partial(indoor_viewpoint, room.place),
+        draw_viewpoint=functools.partial(draw_viewpoint, room.place),
         models=tuple(keys),
         coarse_m=COARSE_M,
     )
@@ -158,38 +169,44 @@ def _living(room: Builder) -> None:
     """Sofa, table before it, television opposite, armchairs beside."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
-    sofa = place.at_wall(find("sofa"), gap=rng.choice([0.03, rng.uniform(0.1, 0.8)]))
+    models_of = room.furniture.of
+    sofa = place.at_wall(models_of("sofa"), gap=rng.choice([0.03, rng.uniform(0.1, 0.8)]))
     if sofa is not None:
         # Points are given as (sideways, forward) of the sofa's middle.
         depth = sofa.model.entry.size_m[1]
         front = sofa.beside(0.0, depth / 2 + rng.uniform(0.5, 0.8))
         _rug(room, sofa.beside(0.0, depth / 2 + 0.4), sofa.angle)
-        table = place.on_floor(find("coffee_table"), front, 0.06, sofa.angle + rng.normal(0, 4))
+        table = place.on_floor(
+            models_of("coffee_table"), front, 0.06, sofa.angle + rng.normal(0, 4)
+        )
         if table is not None:
-            place.on_top(table, find("living_small"), int(rng.integers(1, 6)), facing=False)
-            place.on_top(table, find("vase") + find("small_plant"), 1)
+            place.on_top(
+                table, models_of("living_small"), count=int(rng.integers(1, 6)), facing=False
+            )
+            place.on_top(table, models_of("vase") + models_of("small_plant"), count=1)
         for side in (-1, 1):
             if rng.random() < 0.6:
                 where = sofa.beside(side * rng.uniform(1.2, 1.9), rng.uniform(1.0, 1.6))
                 place.on_floor(
-                    find("armchair"), where, 0.1, sofa.angle - side * rng.uniform(50, 100)
+                    models_of("armchair"), where, 0.1, sofa.angle - side * rng.uniform(50, 100)
                 )
             # A small table at the sofa's end, with a lamp.
             if rng.random() < 0.5:
                 beside = sofa.beside(side * (sofa.model.entry.size_m[0] / 2 + 0.35), 0.0)
-                small = place.on_floor(find("bedside"), beside, 0.0, sofa.angle, tries=3)
+                small = place.on_floor(models_of("bedside"), beside, 0.0, sofa.angle, tries=3)
                 if small is not None:
-                    place.on_top(small, find("table_lamp"), 1)
-        place.on_top(sofa, find("pet") + find("sitting_person"), int(rng.random() < 0.2))
-        stand = place.at_wall(find("tv_stand"), _opposite(sofa.angle))
+                    place.on_top(small, models_of("table_lamp"), count=1)
+        place.on_top(
+            sofa, models_of("pet") + models_of("sitting_person"), count=int(rng.random() < 0.2)
+        )
+        stand = place.at_wall(models_of("tv_stand"), _opposite(sofa.angle))
         if stand is not None:
-            place.on_top(stand, find("tv"), 1, at=(0.0, 0.0))
-            place.on_top(stand, find("living_small") + find("vase"), 3)
+            place.on_top(stand, models_of("tv"), count=1, at=(0.0, 0.0))
+            place.on_top(stand, models_of("living_small") + models_of("vase"), count=3)
     if rng.random() < 0.25:
-        place.at_wall(find("fireplace"))
+        place.at_wall(models_of("fireplace"))
     if rng.random() < 0.12:
-        place.at_wall(find("piano"))
+        place.at_wall(models_of("piano"))
     if rng.random() < 0.5:
         _dining_group(room, None)
 
@@ -198,41 +215,53 @@ def _bedroom(room: Builder) -> None:
     """A bed with its head at a wall, a small table at each side, a wardrobe."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
-    bed = place.at_wall(find("bed"))
+    models_of = room.furniture.of
+    bed = place.at_wall(models_of("bed"))
     if bed is not None:
         width, depth, _ = bed.model.entry.size_m
         _rug(room, bed.beside(rng.normal(0, 0.4), depth / 2), bed.angle)
         # Both small tables are of one kind.
-        table = find("bedside")
+        table = models_of("bedside")
         chosen = [table[int(rng.integers(len(table)))]] if table else []
         for side in (-1, 1):
             where = bed.beside(side * (width / 2 + 0.33), -depth / 2 + 0.3)
             small = place.on_floor(chosen, where, 0.0, bed.angle, 0.0, tries=1)
             if small is not None:
-                place.on_top(small, find("table_lamp"), 1)
-                place.on_top(small, find("bedroom_small"), 2)
+                place.on_top(small, models_of("table_lamp"), count=1)
+                place.on_top(small, models_of("bedroom_small"), count=2)
         place.on_top(
-            bed, find("bedroom_small") + find("toy"), int(rng.integers(0, 3)), facing=False
+            bed,
+            models_of("bedroom_small") + models_of("toy"),
+            count=int(rng.integers(0, 3)),
+            facing=False,
         )
-        place.on_top(bed, find("pet") + find("floor_person"), int(rng.random() < 0.2), facing=False)
-    place.at_wall(find("wardrobe"))
-    chest = place.at_wall(find("sideboard"))
+        place.on_top(
+            bed,
+            models_of("pet") + models_of("floor_person"),
+            count=int(rng.random() < 0.2),
+            facing=False,
+        )
+    place.at_wall(models_of("wardrobe"))
+    chest = place.at_wall(models_of("sideboard"))
     if chest is not None:
-        place.on_top(chest, find("bedroom_small") + find("vase") + find("small_plant"), 4)
+        place.on_top(
+            chest,
+            models_of("bedroom_small") + models_of("vase") + models_of("small_plant"),
+            count=4,
+        )
     if rng.random() < 0.5:
         _desk(room)
     if rng.random() < 0.5:
-        place.in_corner(find("armchair"))
+        place.in_corner(models_of("armchair"))
 
 
 def _kitchen(room: Builder) -> None:
     """Cabinets in a row with sink and stove, others above, a fridge, a table if there is room."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
-    lower = find("lower_cabinet")
-    upper = find("upper_cabinet")
+    models_of = room.furniture.of
+    lower = models_of("lower_cabinet")
+    upper = models_of("upper_cabinet")
     if lower and upper:
         # One kitchen has one kind of cabinet.
         base = lower[int(rng.integers(len(lower)))]
@@ -246,7 +275,7 @@ def _kitchen(room: Builder) -> None:
         # in between, each once.
         length = place.length(wall)
         along = 0.02 if rng.random() < 0.5 else rng.uniform(0.05, 0.6)
-        special = [find("fridge"), find("sink"), find("stove"), find("washer")]
+        special = [models_of("fridge"), models_of("sink"), models_of("stove"), models_of("washer")]
         rng.shuffle(special)
         while along < length - 0.3:
             group = special.pop() if special and rng.random() < 0.45 else lower
@@ -260,8 +289,8 @@ def _kitchen(room: Builder) -> None:
             if thing is not None:
                 # Low ones carry small things, and have another cabinet or a hood above.
                 if model.entry.size_m[2] < 1.0:
-                    place.on_top(thing, find("kitchen_small"), int(rng.integers(0, 4)))
-                above = upper if group is not find("stove") else find("hood")
+                    place.on_top(thing, models_of("kitchen_small"), count=int(rng.integers(0, 4)))
+                above = upper if group is not models_of("stove") else models_of("hood")
                 if rng.random() < 0.75 and model.entry.size_m[2] < 1.3 and above:
                     chosen = above[int(rng.integers(len(above)))]
                     place.at_wall([chosen], wall, along + width / 2, z=1.45, margin=-0.02)
@@ -269,10 +298,10 @@ def _kitchen(room: Builder) -> None:
 
     # A block in the middle of the room.
     if rng.random() < 0.3:
-        island = place.on_floor(find("island"), angle=float(rng.choice([0, 90])), margin=0.5)
+        island = place.on_floor(models_of("island"), angle=float(rng.choice([0, 90])), margin=0.5)
         if island is not None:
-            place.on_top(island, find("kitchen_small"), 4)
-            place.on_floor(find("stool"), island.beside(0, 0.6), 0.2)
+            place.on_top(island, models_of("kitchen_small"), count=4)
+            place.on_floor(models_of("stool"), island.beside(0, 0.6), 0.2)
     _dining_group(room, None)
 
 
@@ -280,27 +309,32 @@ def _dining(room: Builder) -> None:
     """A table in the middle with chairs, and a sideboard."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
+    models_of = room.furniture.of
     middle = (place.width / 2 + rng.normal(0, 0.3), place.depth / 2 + rng.normal(0, 0.3))
     _rug(room, middle, float(rng.choice([0, 90])))
     _dining_group(room, middle)
     for _ in range(2):
-        board = place.at_wall(find("sideboard"))
+        board = place.at_wall(models_of("sideboard"))
         if board is not None:
-            things = find("vase") + find("small_plant") + find("living_small") + find("table_lamp")
-            place.on_top(board, things, int(rng.integers(2, 6)))
+            things = (
+                models_of("vase")
+                + models_of("small_plant")
+                + models_of("living_small")
+                + models_of("table_lamp")
+            )
+            place.on_top(board, things, count=int(rng.integers(2, 6)))
 
 
 def _dining_group(room: Builder, middle: tuple[float, float] | None) -> None:
     """A table with chairs around it that look at it, laid or not."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
+    models_of = room.furniture.of
     angle = float(rng.choice([0, 90])) + rng.normal(0, 2)
-    table = place.on_floor(find("dining_table"), middle, 0.15, angle, margin=0.35)
+    table = place.on_floor(models_of("dining_table"), middle, 0.15, angle, margin=0.35)
     if table is None:
         return
-    chairs = find("chair")
+    chairs = models_of("chair")
     chair = [chairs[int(rng.integers(len(chairs)))]] if chairs else []
     # Seats are (sideways, forward, turn) from the table's middle and angle: the two long sides, two
     # seats each at a long table, then the two ends.
@@ -329,16 +363,21 @@ def _dining_group(room: Builder, middle: tuple[float, float] | None) -> None:
             if inside and not any(thing.box.meets(other) for other in others):
                 place.put(thing)
                 if rng.random() < 0.06:
-                    place.on_top(thing, find("sitting_person"), 1, at=(0.0, 0.05))
+                    place.on_top(thing, models_of("sitting_person"), count=1, at=(0.0, 0.05))
                 # A plate and a cup on the table's edge before the chair.
                 if rng.random() < 0.7:
                     inner = (
                         sideways - (math.copysign(0.25, sideways) if forward == 0 else 0),
                         forward - (math.copysign(0.25, forward) if forward else 0),
                     )
-                    place.on_top(table, find("table_setting"), 1, at=inner)
-    things = find("vase") + find("small_plant") + find("kitchen_small") + find("living_small")
-    place.on_top(table, things, int(rng.integers(1, 6)), facing=False)
+                    place.on_top(table, models_of("table_setting"), count=1, at=inner)
+    things = (
+        models_of("vase")
+        + models_of("small_plant")
+        + models_of("kitchen_small")
+        + models_of("living_small")
+    )
+    place.on_top(table, things, count=int(rng.integers(1, 6)), facing=False)
     if rng.random() < 0.5:
         _pendant(room, table.x, table.y)
 
@@ -352,7 +391,7 @@ def _office(room: Builder) -> None:
     for _ in range(2):
         cabinet = place.at_wall(room.furniture.of("sideboard"))
         if cabinet is not None:
-            place.on_top(cabinet, room.furniture.of("office_small"), 3)
+            place.on_top(cabinet, room.furniture.of("office_small"), count=3)
     if rng.random() < 0.5:
         place.at_wall(room.furniture.of("workshop"))
 
@@ -361,67 +400,67 @@ def _desk(room: Builder) -> None:
     """A desk at a wall, or in the room; a chair before it, a computer and papers on it."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
-    desk = place.at_wall(find("desk"), gap=rng.choice([0.02, 0.9], p=[0.75, 0.25]), margin=0.2)
+    models_of = room.furniture.of
+    desk = place.at_wall(models_of("desk"), gap=rng.choice([0.02, 0.9], p=[0.75, 0.25]), margin=0.2)
     if desk is None:
         return
     depth = desk.model.entry.size_m[1]
     seat = desk.beside(rng.normal(0, 0.15), depth / 2 + 0.3)
-    place.on_floor(find("desk_chair"), seat, 0.08, desk.angle + 180 + rng.normal(0, 40), 0.0)
-    place.on_top(desk, find("computer"), 1, at=(rng.normal(0, 0.15), -0.05))
-    place.on_top(desk, find("table_lamp"), int(rng.random() < 0.6))
-    place.on_top(desk, find("office_small"), int(rng.integers(2, 7)), facing=False)
+    place.on_floor(models_of("desk_chair"), seat, 0.08, desk.angle + 180 + rng.normal(0, 40), 0.0)
+    place.on_top(desk, models_of("computer"), count=1, at=(rng.normal(0, 0.15), -0.05))
+    place.on_top(desk, models_of("table_lamp"), count=int(rng.random() < 0.6))
+    place.on_top(desk, models_of("office_small"), count=int(rng.integers(2, 7)), facing=False)
 
 
 def _bathroom(room: Builder) -> None:
     """Bath or shower, basin with small things, toilet, towels."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
-    place.at_wall(find("bath") if rng.random() < 0.7 else find("shower"))
+    models_of = room.furniture.of
+    place.at_wall(models_of("bath") if rng.random() < 0.7 else models_of("shower"))
     for group, share in (("basin", 1.0), ("toilet", 1.0), ("bidet", 0.3), ("washer", 0.4)):
         if rng.random() < share:
-            thing = place.at_wall(find(group))
+            thing = place.at_wall(models_of(group))
             if thing is not None and group != "toilet":
-                place.on_top(thing, find("bath_small"), 3)
-    place.at_wall(find("towel_rack"))
-    place.on_floor(find("floor_clutter"), tries=6)
+                place.on_top(thing, models_of("bath_small"), count=3)
+    place.at_wall(models_of("towel_rack"))
+    place.on_floor(models_of("floor_clutter"), tries=6)
 
 
 def _kids(room: Builder) -> None:
     """A bed, shelves, and toys on the floor."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
-    bed = place.at_wall(find("kids_bed"))
+    models_of = room.furniture.of
+    bed = place.at_wall(models_of("kids_bed"))
     if bed is not None:
-        place.on_top(bed, find("toy"), 2, facing=False)
+        place.on_top(bed, models_of("toy"), count=2, facing=False)
     _desk(room)
     _rug(room, (place.width / 2, place.depth / 2), 0.0)
-    chest = place.at_wall(find("sideboard"))
+    chest = place.at_wall(models_of("sideboard"))
     if chest is not None:
-        place.on_top(chest, find("toy"), 4)
-    place.at_wall(find("wardrobe"))
+        place.on_top(chest, models_of("toy"), count=4)
+    place.at_wall(models_of("wardrobe"))
     for _ in range(int(rng.integers(4, 12))):
-        place.on_floor(find("toy"))
+        place.on_floor(models_of("toy"))
     if rng.random() < 0.4:
-        place.on_floor(find("floor_person"))
+        place.on_floor(models_of("floor_person"))
 
 
 def _hobby(room: Builder) -> None:
     """Games or a workshop, and things that are stored."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
+    models_of = room.furniture.of
     if rng.random() < 0.6:
         middle = (place.width / 2, place.depth / 2)
-        place.on_floor(find("hobby"), middle, 0.4, float(rng.choice([0, 90])), 0.4)
+        place.on_floor(models_of("hobby"), middle, 0.4, float(rng.choice([0, 90])), 0.4)
     for _ in range(int(rng.integers(4, 12))):
-        thing = place.at_wall(find("workshop"), gap=rng.uniform(0.02, 0.2))
+        thing = place.at_wall(models_of("workshop"), gap=rng.uniform(0.02, 0.2))
         if thing is not None:
-            place.on_top(thing, find("tool"), 2, facing=False)
+            place.on_top(thing, models_of("tool"), count=2, facing=False)
     for _ in range(int(rng.integers(1, 5))):
-        place.on_floor(find("workshop"))
+        place.on_floor(models_of("workshop"))
 
 
 RULES: dict[str, Callable[[Builder], None]] = {
@@ -440,32 +479,34 @@ def _everywhere(room: Builder) -> None:
     """What any room may have: bookcases, plants, lamps, clutter, people."""
     rng = room.rng
     place = room.place
-    find = room.furniture.of
+    models_of = room.furniture.of
     if room.kind not in ("bathroom", "kitchen"):
         for _ in range(int(rng.integers(0, 4))):
             _bookcase(room)
         for _ in range(int(rng.integers(0, 3))):
-            place.at_wall(find("bookcase"))
+            place.at_wall(models_of("bookcase"))
         for _ in range(int(rng.integers(0, 2))):
-            place.at_wall(find("sideboard"))
+            place.at_wall(models_of("sideboard"))
         if rng.random() < 0.3:
-            place.at_wall(find("radiator"))
+            place.at_wall(models_of("radiator"))
     for _ in range(int(rng.choice([0, 1, 2, 4]))):
-        place.in_corner(find("floor_plant"))
+        place.in_corner(models_of("floor_plant"))
     if rng.random() < 0.3:
-        place.in_corner(find("floor_lamp"))
+        place.in_corner(models_of("floor_lamp"))
     for _ in range(int(rng.choice([0, 1, 3, 6], p=[0.3, 0.3, 0.25, 0.15]))):
-        place.on_floor(find("floor_clutter"))
+        place.on_floor(models_of("floor_clutter"))
     for _ in range(int(rng.integers(0, 3))):
-        place.at_wall(find("wall_thing"), margin=0.0)
+        place.at_wall(models_of("wall_thing"), margin=0.0)
     if rng.random() < 0.12:
-        place.on_floor(find("person"))
+        place.on_floor(models_of("person"))
     if rng.random() < 0.08:
-        place.on_floor(find("pet"))
+        place.on_floor(models_of("pet"))
     for base in list(place.things):
         # Chairs, chests and shelves collect things.
         if rng.random() < 0.15 and (base.model.entry.top_m or 0) > 0.3 and base.z < 0.1:
-            place.on_top(base, find("living_small") + find("bedroom_small"), 2, facing=False)
+            place.on_top(
+                base, models_of("living_small") + models_of("bedroom_small"), count=2, facing=False
+            )
 
 
 def _opposite(angle: float) -> WallName:
@@ -520,8 +561,10 @@ def _bookcase(room: Builder) -> None:
     turn = rotation_z(thing.angle)
     back = turn @ np.array([0, shelf.depth / 2, 0])
     room.parts.append(shelf.mesh.moved(turn, [thing.x + back[0], thing.y + back[1], 0.0]))
-    find = room.furniture.of
-    things = find("vase") + find("small_plant") + find("living_small") + find("toy")
+    models_of = room.furniture.of
+    things = (
+        models_of("vase") + models_of("small_plant") + models_of("living_small") + models_of("toy")
+    )
     for left, right, level in shelf.free:
         model = things[int(rng.integers(len(things)))] if things else None
         if model is None or rng.random() < 0.35:
@@ -531,7 +574,7 @@ def _bookcase(room: Builder) -> None:
             continue
         x, y = thing.beside((left + right) / 2, 0.0)
         place.things.append(Placed(model, x, y, level, thing.angle + rng.normal(0, 15)))
-    place.on_top(thing, things, int(rng.integers(0, 3)))
+    place.on_top(thing, things, count=int(rng.integers(0, 3)))
 
 
 def _pendant(room: Builder, x: float, y: float) -> None:

@@ -122,6 +122,45 @@ def indoor_viewpoint(place: Place, rng: Rng, height: int, width: int) -> Viewpoi
     return Viewpoint(eye.astype(np.float32), camera_axes(azimuth, float(pitch), roll), camera)
 
 
+def close_viewpoint(place: Place, rng: Rng, height: int, width: int) -> Viewpoint:
+    """A camera close to a thing in a room, as one photographs a meal, a shelf or a toy.
+
+    Args:
+        place: the room, with its things.
+        rng: draws all of it.
+        height, width: of the picture in pixels.
+    """
+    focal_mm = rng.uniform(26, 75)  # as of a picture on 35 mm film
+    camera = Camera.from_focal(focal_mm_to_px(focal_mm, width, height), width, height)
+    # In most pictures a thing that stands on another one: tables and shelves hold many.
+    raised = [thing for thing in place.things if thing.box.z0 > 0.3]
+    chosen = raised if raised and rng.random() < 0.7 else place.things
+    target = np.array([place.width / 2, place.depth / 2, 0.5])
+    if chosen:
+        box = chosen[int(rng.integers(len(chosen)))].box
+        target = np.array([(box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2, (box.z0 + box.z1) / 2])
+
+    # 0.5 to 1.8 m away to any side, a little above the thing, within the room.
+    away = rng.uniform(0.5, 1.8)
+    side = rng.uniform(0, 2 * math.pi)
+    above = rng.uniform(-0.1, 0.7) * away
+    edge = 0.1  # metres to a wall
+    eye = np.array(
+        [
+            np.clip(target[0] + away * math.cos(side), edge, place.width - edge),
+            np.clip(target[1] + away * math.sin(side), edge, place.depth - edge),
+            np.clip(target[2] + above, 0.15, place.height - 0.3),
+        ]
+    )
+    # The thing is not in the picture's middle.
+    forward = target + rng.normal(0, 0.12 * away, 3) - eye
+    flat = max(float(np.hypot(forward[0], forward[1])), 0.1)
+    pitch = np.clip(math.atan2(forward[2], flat), -1.0, 0.3)
+    azimuth = math.atan2(forward[1], forward[0])
+    roll = math.radians(rng.normal(0, 3.0))
+    return Viewpoint(eye.astype(np.float32), camera_axes(azimuth, float(pitch), roll), camera)
+
+
 def camera_axes(azimuth: float, pitch: float, roll: float) -> Floats:
     """[3, 3] unit vectors of a camera in a world with z up: rows right, down and forward.
 
@@ -155,19 +194,25 @@ def _score(world: World, viewpoint: Viewpoint, near_m: float) -> float:
     depth = hits.distance[hits.triangle >= 0]
     if len(depth) < 0.5 * rows * columns or np.quantile(depth, 0.01) < near_m:
         return -1.0
-    # A thing fills the picture if 30 % of it are nearer than 0.7 m in rooms, where `near_m` is
-    # MIN_NEAR_M; where it is more, this distance grows three times as fast.
-    if np.quantile(depth, 0.3) < 0.7 + 3 * (near_m - MIN_NEAR_M):
+    # One thing fills the picture if 30 % of it are nearer than a limit: 0.7 m in rooms, where
+    # `near_m` is MIN_NEAR_M, 0.4 m close to things, 2.4 m in the open.
+    filled_m = 0.7 + 3 * (near_m - MIN_NEAR_M)
+    if np.quantile(depth, 0.3) < filled_m:
         return -0.5
-    # Many materials (the entropy of their shares of the picture), near and far things, and not
-    # too much sky.
+
+    # Four measures, weighted by eye so that each decides about as often as the others:
+    # the entropy of the materials' shares of the picture, about 1 to 3; ...
     materials = world.mesh.material[hits.triangle[hits.triangle >= 0]]
     counts = np.bincount(materials)
     shares = counts[counts > 0] / len(materials)
     variety = float(-(shares * np.log(shares)).sum())
-    spread = float(np.log(depth).std())
-    openness = 1 - len(depth) / (rows * columns)
-    return variety + 1.5 * min(spread, 0.7) + 0.3 * min(float(np.median(depth)), 4) - 2 * openness
+    # ... near and far things together, of which more than 0.7 (a factor of 2) is no better; ...
+    spread = min(float(np.log(depth).std()), 0.7)
+    # ... some distance, so that not one wall is seen from close by, of which 4 m are enough; ...
+    distance_m = min(float(np.median(depth)), 4.0)
+    # ... and not too much sky, as a share of the picture.
+    sky = 1 - len(depth) / (rows * columns)
+    return variety + 1.5 * spread + 0.3 * distance_m - 2 * sky
 
 
 def second_cameras(

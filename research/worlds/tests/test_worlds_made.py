@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 import torch
 from made_models import lights, write_catalogue
+from PIL import Image
 
 pytest.importorskip("embreex", reason="needs research/worlds/requirements.txt")
 
 from worlds import surfaces, views, world_sheet
 from worlds.furniture import Furniture
 from worlds.library import Library
-from worlds.make import PackedWorld, make_shards, make_world
+from worlds.make import PackedWorld, make_shards, make_world, photos_of
 from worlds.placing import Box, Opening, Place
 from worlds.plans import WorldPlan
 from worlds.rooms import furnish
 from worlds.shards import read_view, shard_file, world_facts, world_keys, write_shard
 
 from spackle.cli.script_command import run_script
+from spackle.runtime.errors import InputError
 
 pytestmark = pytest.mark.slow
 SIZE = (48, 64)
@@ -131,6 +133,20 @@ def test_a_world_of_one_view_has_the_photo_alone(
     assert len(world_facts(shard, key)["views"]) == 1
 
 
+def test_a_close_up_is_taken_within_a_room_near_a_thing(furniture: Furniture, cache: Path) -> None:
+    room = furnish(np.random.default_rng(4), furniture, cache, None)
+    close = furnish(np.random.default_rng(4), furniture, cache, None, close=True)
+    assert close.mesh.count == room.mesh.count  # the same room
+    corners = close.mesh.corners.reshape(-1, 3)
+    for seed in range(20):
+        viewpoint = close.draw_viewpoint(np.random.default_rng(seed), 48, 64)
+        assert (viewpoint.eye[:2] > corners.min(0)[:2]).all()
+        assert (viewpoint.eye < corners.max(0)).all()
+        # 1.8 m to the middle of a thing, and 0.7 of that above it.
+        nearest = np.linalg.norm(corners - viewpoint.eye, axis=1).min()
+        assert nearest < 1.8 * 1.25
+
+
 def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
     made: list[int] = []
 
@@ -147,6 +163,24 @@ def test_a_stopped_run_goes_on_and_keeps_what_is_there(tmp_path: Path) -> None:
     make_shards(tmp_path, make, 12, (0, 1), print)
     assert made == [*range(9), *range(8, 12)]
     assert shard_file(tmp_path, 1).read_bytes()[:1] == bytes([8])
+
+
+def test_photos_that_cannot_be_read_are_named_once_and_passed_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.new("RGB", (8, 6), (90, 100, 110)).save(tmp_path / "good.png")
+    (tmp_path / "broken.jpg").write_bytes(b"no photo")
+    draw = photos_of(tmp_path)
+    assert draw is not None
+    for seed in range(8):
+        assert draw(np.random.default_rng(seed)).shape == (6, 8, 3)
+    assert capsys.readouterr().err.count("broken.jpg") == 1
+
+    (tmp_path / "good.png").write_bytes(b"no photo either")
+    with pytest.raises(InputError, match="contains no photos"):
+        draw(np.random.default_rng(0))
+    with pytest.raises(InputError, match="contains no photos"):
+        photos_of(tmp_path / "none")
 
 
 def test_two_processes_share_the_work(tmp_path: Path) -> None:
