@@ -83,9 +83,9 @@ def check_claims(out: Path) -> None:
         run = load_run(out / "runs" / f"{name}-large")
         assert low < gaussians_per_masked_cell(run) < high, name
         # The shipped weights are trained for Spackle's own two passes: in the paper's single pass
-        # they leave more open.
+        # they leave more open, a half of the yard's holes and 11 to 28 % of the others'.
         hole_ratio = mean_of(run, "paper", "har_before")
-        assert mean_of(run, "paper", "har") < 0.4 * hole_ratio, name
+        assert mean_of(run, "paper", "har") < 0.6 * hole_ratio, name
         assert mean_of(run, "spackle", "har") < 0.01 * hole_ratio, name
 
     # As in the paper's table 4, direct FT damages what lies outside of holes, and the residual
