@@ -12,7 +12,8 @@ from them, and they hang on walls. OFFICE has the frames of TUM RGB-D's sequence
 gardens of models under CC0 and CC BY (research/worlds).
 
 OUT gets the worlds, the two runs, and the results lite.safetensors and residual.safetensors. A
-killed command goes on when it is started again. With two cores it takes three hours.
+killed command goes on when it is started again. Two cores need about three hours, by the times of
+its parts; the whole has been run only in miniature.
 
 residual.safetensors is what ships. lite.safetensors does not: strangers preferred the videos of the
 package's weights of lite (docs/lab/lite.md).
@@ -21,7 +22,6 @@ package's weights of lite (docs/lab/lite.md).
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -38,10 +38,6 @@ from spackle.runtime.folders import make_folder
 
 RESEARCH = Path(__file__).resolve().parent
 MODULES = (RESEARCH.parent / "src", RESEARCH, RESEARCH / "lite")
-# TUM RGB-D's first camera: its focal length in pixels, and metres in a step of the depth files as
-# they are here, which have been shortened from 16 bits at 1/5000 m.
-OFFICE_FOCAL_PX = 525
-OFFICE_UNIT_M = 0.0002
 
 
 class Archives(NamedTuple):
@@ -62,10 +58,9 @@ ARCHIVES = (
     Archives("views", "rooms", worlds=128, views=7, seed=0),
     Archives("views", "streets", worlds=24, views=7, seed=0),
 )
-# The last archives of `views` are for validation alone.
-HELD_ARCHIVES = {"rooms": 2, "streets": 1}
+# So many archives of `views`, the last ones, are for validation alone; by how their names begin.
+HELD_ARCHIVES = {"worlds": 2, "streets": 1}
 PHOTO_ENDING = ".photo.jpg"  # of a world's photo in its archive
-PREFIXES = {"rooms": "worlds", "streets": "streets"}  # of the archives' names
 
 
 def run(*command: str | Path) -> None:
@@ -100,8 +95,8 @@ def share_out(worlds: Path) -> None:
     Args:
         worlds: the folder of worlds, with the archives in its folder `views`.
     """
-    for kind, held in HELD_ARCHIVES.items():
-        archives = sorted((worlds / "views").glob(f"{PREFIXES[kind]}-*.tar"))
+    for prefix, held in HELD_ARCHIVES.items():
+        archives = sorted((worlds / "views").glob(f"{prefix}-*.tar"))
         for position, archive in enumerate(archives):
             is_held = position >= len(archives) - held
             folder = worlds / "held" if is_held else worlds / "learned" / "views"
@@ -166,8 +161,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check_file(options.features, "file of weights")
     make_folder(output)
     worlds = output / "worlds"
-    camera = {"folder": str(options.office), "focal_px": OFFICE_FOCAL_PX, "unit_m": OFFICE_UNIT_M}
-    office = f"data.rgbd={json.dumps([camera])}"
+    # Both recipes have the camera's other facts.
+    office = f"data.rgbd.0.folder={options.office}"
 
     make_worlds(worlds, options.photos)
     share_out(worlds)

@@ -43,7 +43,7 @@ def test_both_networks_are_made_from_models_and_open_photos(
             Archives("views", "rooms", worlds=9, views=7, seed=0),  # two archives
         ),
     )
-    monkeypatch.setattr(rebuild_open, "HELD_ARCHIVES", {"rooms": 1})
+    monkeypatch.setattr(rebuild_open, "HELD_ARCHIVES", {"worlds": 1})
     runpy.run_path(str(LITE_DATA))["write_data"](tmp_path)
     (tmp_path / "none.npz").write_text("not read: the miniature has no feature network")
     out = tmp_path / "out"
